@@ -1,0 +1,244 @@
+"""Cameras: x right, y down, z forward; poses are `world_from_camera`."""
+
+from typing import Any, Self, final
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import check, normalize, parameter
+
+
+def _to_world(
+    world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
+) -> Float[Array, "... 3"]:
+    pose = world_from_camera.astype(points.dtype)
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _to_camera(
+    world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
+) -> Float[Array, "... 3"]:
+    pose = world_from_camera.astype(points.dtype)
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _look_at_pose(eye: Any, target: Any, up: Any) -> Float[Array, "4 4"]:
+    eye = parameter("look_at(eye)", eye, (3,))
+    target = parameter("look_at(target)", target, (3,))
+    up = parameter("look_at(up=...)", up, (3,))
+    forward = normalize(target - eye)
+    right = normalize(jnp.cross(forward, up))
+    check("look_at(target)", forward, lambda v: v.any(), "away from `eye`")
+    check("look_at(up=...)", right, lambda v: v.any(), "off the direction of view")
+    down = jnp.cross(forward, right)
+    columns = jnp.stack([right, down, forward, eye], axis=1)
+    return jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
+
+
+@final
+class PinholeCamera(eqx.Module):
+    """A perspective camera with square or oblong pixels, skew allowed.
+
+    **Arguments:**
+
+    - `intrinsics`: 3x3, from camera axes to pixels (focal lengths and principal point in
+      pixels, last row 0 0 1).
+    - `world_from_camera`: 4x4 rigid pose; its rotation is taken to be orthonormal.
+
+    **Raises:** `ValueError` for a wrong shape.
+
+    **Gradient:** exact with respect to both fields. The pose is not projected back onto the
+    rigid motions: parametrize it, by a twist say, to stay on them.
+    """
+
+    intrinsics: Float[Array, "3 3"]
+    world_from_camera: Float[Array, "4 4"]
+
+    def __init__(self, intrinsics: Any, world_from_camera: Any):
+        self.intrinsics = parameter("PinholeCamera(intrinsics)", intrinsics, (3, 3))
+        self.world_from_camera = parameter(
+            "PinholeCamera(world_from_camera)", world_from_camera, (4, 4)
+        )
+
+    @classmethod
+    def from_fov(
+        cls, fov_y: Any, *, height: int, width: int, world_from_camera: Any | None = None
+    ) -> Self:
+        """Square pixels and a centred principal point.
+
+        **Arguments:**
+
+        - `fov_y`: vertical field of view, in radians, between 0 and pi.
+        - `height`, `width`: image size in pixels.
+        - `world_from_camera`: the pose; the identity by default.
+
+        **Returns:** the camera.
+
+        **Raises:** `ValueError` for a field of view out of range.
+
+        **Gradient:** exact in `fov_y`.
+        """
+        fov_y = parameter("from_fov(fov_y)", fov_y)
+        check("from_fov(fov_y)", fov_y, lambda v: (v > 0) & (v < jnp.pi), "in (0, pi) radians")
+        focal = height / (2 * jnp.tan(fov_y / 2))
+        zero, one = jnp.zeros_like(focal), jnp.ones_like(focal)
+        rows = [
+            [focal, zero, one * (width / 2)],
+            [zero, focal, one * (height / 2)],
+            [zero, zero, one],
+        ]
+        intrinsics = jnp.stack([jnp.stack(row) for row in rows])
+        pose = jnp.eye(4, dtype=focal.dtype) if world_from_camera is None else world_from_camera
+        return cls(intrinsics, pose)
+
+    @classmethod
+    def look_at(
+        cls, eye: Any, target: Any, *, up: Any, fov_y: Any, height: int, width: int
+    ) -> Self:
+        """The camera at `eye` that has `target` at the middle of its picture.
+
+        **Arguments:**
+
+        - `eye`, `target`: world positions, 3.
+        - `up`: a world direction, 3, that points to the top of the picture.
+        - `fov_y`, `height`, `width`: as in `from_fov`.
+
+        **Returns:** the camera.
+
+        **Raises:** `ValueError` where `eye` is `target` or `up` lies along the view.
+
+        **Gradient:** exact; zero where the pose is degenerate.
+        """
+        pose = _look_at_pose(eye, target, up)
+        return cls.from_fov(fov_y, height=height, width=width, world_from_camera=pose)
+
+    def project(
+        self, points: Float[Array, "... 3"]
+    ) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
+        """Pixels and depth of world points.
+
+        **Arguments:** `points`: world positions, `... 3`, in scene units.
+
+        **Returns:** `pixels`, `... 2`, as (x, y) with centres at +0.5; and `depth`, `...`,
+        along the optical axis. A point behind the camera has a negative depth, and its pixels
+        are those of the line through the eye.
+
+        **Gradient:** exact; infinite where the depth is 0.
+        """
+        points = jnp.asarray(points)
+        local = _to_camera(self.world_from_camera, points)
+        depth = local[..., 2]
+        scaled = local @ self.intrinsics.astype(points.dtype).T
+        return scaled[..., :2] / depth[..., None], depth
+
+    def unproject(
+        self, pixels: Float[Array, "... 2"], depth: Float[Array, "..."]
+    ) -> Float[Array, "... 3"]:
+        """World points of pixels at a depth: the inverse of `project`.
+
+        **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis.
+
+        **Returns:** world positions, `... 3`. Infinite depth gives non-finite points.
+
+        **Gradient:** exact.
+        """
+        pixels, depth = jnp.asarray(pixels), jnp.asarray(depth)
+        homogeneous = jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
+        inverse = jnp.linalg.inv(self.intrinsics).astype(pixels.dtype)
+        rays = homogeneous @ inverse.T
+        return _to_world(self.world_from_camera, rays * depth[..., None])
+
+    def through_lens(self, offset: Any, *, focus_distance: Any) -> Self:
+        """The off-axis camera at a point of the lens whose focus plane stays where it is.
+
+        A point at depth `focus_distance` keeps its pixel; one at depth Z moves by
+        `offset * focal * (1 / focus_distance - 1 / Z)` pixels.
+
+        **Arguments:**
+
+        - `offset`: 2, from the lens' centre along the camera's x and y, in scene units.
+        - `focus_distance`: depth of the plane that stays fixed, in scene units.
+
+        **Returns:** the camera: the eye moved, the principal point sheared.
+
+        **Raises:** `ValueError` for a focus distance that is not positive.
+
+        **Gradient:** exact.
+
+        Source: Haeberli & Akeley 1990, the accumulation buffer's depth of field.
+        """
+        dtype = self.intrinsics.dtype
+        offset = parameter("through_lens(offset)", offset, (2,)).astype(dtype)
+        distance = parameter("through_lens(focus_distance=...)", focus_distance).astype(dtype)
+        check("through_lens(focus_distance=...)", distance, lambda v: v > 0, "positive")
+        shear = self.intrinsics[:2, :2] @ offset / distance
+        intrinsics = self.intrinsics.at[:2, 2].add(shear)
+        axes = self.world_from_camera[:3, :2]
+        pose = self.world_from_camera.at[:3, 3].add(
+            axes @ offset.astype(self.world_from_camera.dtype)
+        )
+        return type(self)(intrinsics, pose)
+
+
+@final
+class OrthographicCamera(eqx.Module):
+    """A camera whose rays are parallel: a directional light's, say.
+
+    **Arguments:**
+
+    - `pixels_per_unit`: scale, in pixels per scene unit.
+    - `centre`: 2, the pixel (x, y) of the optical axis.
+    - `world_from_camera`: 4x4 rigid pose.
+
+    **Raises:** `ValueError` for a wrong shape or a scale that is not positive.
+
+    **Gradient:** exact with respect to every field.
+    """
+
+    pixels_per_unit: Float[Array, ""]
+    centre: Float[Array, "2"]
+    world_from_camera: Float[Array, "4 4"]
+
+    def __init__(self, pixels_per_unit: Any, centre: Any, world_from_camera: Any):
+        name = "OrthographicCamera(pixels_per_unit)"
+        self.pixels_per_unit = parameter(name, pixels_per_unit)
+        check(name, self.pixels_per_unit, lambda v: v > 0, "positive")
+        self.centre = parameter("OrthographicCamera(centre)", centre, (2,))
+        self.world_from_camera = parameter(
+            "OrthographicCamera(world_from_camera)", world_from_camera, (4, 4)
+        )
+
+    def project(
+        self, points: Float[Array, "... 3"]
+    ) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
+        """Pixels and depth of world points.
+
+        **Arguments:** `points`: world positions, `... 3`, in scene units.
+
+        **Returns:** `pixels`, `... 2`, (x, y); `depth`, `...`, along the optical axis.
+
+        **Gradient:** exact.
+        """
+        points = jnp.asarray(points)
+        local = _to_camera(self.world_from_camera, points)
+        scale, centre = self.pixels_per_unit, self.centre
+        pixels = local[..., :2] * scale.astype(points.dtype) + centre.astype(points.dtype)
+        return pixels, local[..., 2]
+
+    def unproject(
+        self, pixels: Float[Array, "... 2"], depth: Float[Array, "..."]
+    ) -> Float[Array, "... 3"]:
+        """World points of pixels at a depth: the inverse of `project`.
+
+        **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis.
+
+        **Returns:** world positions, `... 3`.
+
+        **Gradient:** exact.
+        """
+        pixels, depth = jnp.asarray(pixels), jnp.asarray(depth)
+        scale, centre = self.pixels_per_unit, self.centre
+        plane = (pixels - centre.astype(pixels.dtype)) / scale.astype(pixels.dtype)
+        local = jnp.concatenate([plane, depth[..., None]], axis=-1)
+        return _to_world(self.world_from_camera, local)

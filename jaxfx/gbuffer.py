@@ -1,0 +1,72 @@
+"""The deep frame buffer: what a pixel shows, before any light falls on it."""
+
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfx._numerics import parameter
+
+
+@final
+class GBuffer(eqx.Module):
+    """The eight parameters of every pixel that no light changes.
+
+    Position is not among them: it follows from `depth` and the camera.
+
+    **Arguments:** images of one height and width.
+
+    - `color`: height width 3, base colour of the surface, linear RGB.
+    - `shader`: height width, integers: -1 nothing, 0 Lambert, 1 Phong, 2 Blinn.
+    - `ambient`, `diffuse`, `specular`: height width 3, the linear RGB reflectances that
+      ambient, diffuse and specular light meet (the base colour is already in them).
+    - `normal`: height width 3, unit vectors in world space, zero where there is nothing.
+    - `depth`: height width, scene units along the optical axis, inf where there is nothing.
+    - `roughness`: height width, in [0, 1].
+
+    **Raises:** `ValueError` where a shape does not fit `color`, or `shader` is not of integers.
+
+    **Gradient:** exact with respect to every float image; `shader` has none.
+
+    Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting.
+    """
+
+    color: Float[Array, "height width 3"]
+    shader: Int[Array, "height width"]
+    ambient: Float[Array, "height width 3"]
+    diffuse: Float[Array, "height width 3"]
+    specular: Float[Array, "height width 3"]
+    normal: Float[Array, "height width 3"]
+    depth: Float[Array, "height width"]
+    roughness: Float[Array, "height width"]
+
+    def __init__(
+        self,
+        color: Any,
+        shader: Any,
+        ambient: Any,
+        diffuse: Any,
+        specular: Any,
+        normal: Any,
+        depth: Any,
+        roughness: Any,
+    ):
+        shape = jnp.shape(color)
+        if len(shape) != 3 or shape[2] != 3:
+            raise ValueError(
+                f"`GBuffer(color)` must have shape (height, width, 3), got {shape}."
+            )
+        self.color = parameter("GBuffer(color)", color, shape)
+        self.shader = jnp.asarray(shader)
+        if self.shader.shape != shape[:2] or not jnp.issubdtype(self.shader.dtype, jnp.integer):
+            raise ValueError(
+                f"`GBuffer(shader)` must hold integers of shape {shape[:2]}, "
+                f"got {self.shader.dtype} of shape {self.shader.shape}."
+            )
+        self.ambient = parameter("GBuffer(ambient)", ambient, shape)
+        self.diffuse = parameter("GBuffer(diffuse)", diffuse, shape)
+        self.specular = parameter("GBuffer(specular)", specular, shape)
+        self.normal = parameter("GBuffer(normal)", normal, shape)
+        self.depth = parameter("GBuffer(depth)", depth, shape[:2])
+        self.roughness = parameter("GBuffer(roughness)", roughness, shape[:2])
