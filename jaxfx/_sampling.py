@@ -5,8 +5,8 @@ coordinates are always (x, y).
 """
 
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
-from numpy.typing import DTypeLike
 
 
 def pixel_centers(
