@@ -6,6 +6,7 @@ The floor under everything else: arrays only, no types of this package.
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
