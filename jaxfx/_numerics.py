@@ -3,6 +3,7 @@
 The floor under everything else: arrays only, no types of this package.
 """
 
+import math
 from typing import Any
 
 import jax
@@ -82,15 +83,29 @@ def check_depth(name: str, depth: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def working_dtype(dtype: DTypeLike) -> jnp.dtype:
-    """The type that an image of `dtype` is computed in: float32 or wider."""
-    return jnp.promote_types(dtype, jnp.float32)
+def working_dtype(*dtypes: DTypeLike) -> jnp.dtype:
+    """The type that images of `dtypes` are computed in: the widest, float32 at least."""
+    # Asked for by name, so allowed where promotion is strict.
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.result_type(*dtypes, jnp.float32)
 
 
+@jax.custom_jvp
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root whose value and derivative are 0 where `x` is 0 or negative."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    """Square root whose value and derivative are 0 where `x` is 0 or negative.
+
+    Not by a double `where`: XLA may compute its predicate twice, rounded differently, and then
+    selects what stood in for the root.
+    """
+    return jnp.sqrt(jnp.maximum(x, 0))
+
+
+@safe_sqrt.defjvp
+def _safe_sqrt_jvp(primals, tangents):
+    (x,), (x_dot,) = primals, tangents
+    root = safe_sqrt(x)
+    floor = math.sqrt(jnp.finfo(x.dtype).tiny)  # its square, in a second derivative, is not 0
+    return root, root / (2 * jnp.maximum(x, floor)) * x_dot
 
 
 def safe_divide(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -105,9 +120,16 @@ def normalize(vector: Float[Array, "... n"]) -> Float[Array, "... n"]:
     return safe_divide(vector, length)
 
 
+@jax.custom_jvp
 def clip01(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Clamp to [0, 1]. At a kink the derivative is the one from above: 1 at 0, 0 at 1."""
-    return jnp.where(x < 0, 0, jnp.where(x < 1, x, 1))
+    return jnp.clip(x, 0, 1)
+
+
+@clip01.defjvp
+def _clip01_jvp(primals, tangents):
+    (x,), (x_dot,) = primals, tangents
+    return clip01(x), jnp.where((x >= 0) & (x < 1), x_dot, 0)
 
 
 def absolute(x: Float[Array, "..."]) -> Float[Array, "..."]:

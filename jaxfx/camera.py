@@ -1,6 +1,6 @@
 """Cameras: x right, y down, z forward; poses are `world_from_camera`."""
 
-from typing import Any, Self, final
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -64,7 +64,7 @@ class PinholeCamera(eqx.Module):
     @classmethod
     def from_fov(
         cls, fov_y: Any, *, height: int, width: int, world_from_camera: Any | None = None
-    ) -> Self:
+    ) -> "PinholeCamera":
         """Square pixels and a centred principal point.
 
         **Arguments:**
@@ -95,7 +95,7 @@ class PinholeCamera(eqx.Module):
     @classmethod
     def look_at(
         cls, eye: Any, target: Any, *, up: Any, fov_y: Any, height: int, width: int
-    ) -> Self:
+    ) -> "PinholeCamera":
         """The camera at `eye` that has `target` at the middle of its picture.
 
         **Arguments:**
@@ -149,7 +149,7 @@ class PinholeCamera(eqx.Module):
         rays = homogeneous @ inverse.T
         return _to_world(self.world_from_camera, rays * depth[..., None])
 
-    def through_lens(self, offset: Any, *, focus_distance: Any) -> Self:
+    def through_lens(self, offset: Any, *, focus_distance: Any) -> "PinholeCamera":
         """The off-axis camera at a point of the lens whose focus plane stays where it is.
 
         A point at depth `focus_distance` keeps its pixel; one at depth Z moves by
@@ -178,7 +178,7 @@ class PinholeCamera(eqx.Module):
         pose = self.world_from_camera.at[:3, 3].add(
             axes @ offset.astype(self.world_from_camera.dtype)
         )
-        return type(self)(intrinsics, pose)
+        return PinholeCamera(intrinsics, pose)
 
 
 @final

@@ -1,6 +1,6 @@
 """Lenses: from depth to the diameter of the circle of confusion, in pixels."""
 
-from typing import Any, Self, final
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -50,7 +50,9 @@ class ThinLens(eqx.Module):
         check("ThinLens(focal_pixels)", self.focal_pixels, lambda v: v > 0, "positive")
 
     @classmethod
-    def from_camera(cls, camera: PinholeCamera, *, aperture: Any, focus_distance: Any) -> Self:
+    def from_camera(
+        cls, camera: PinholeCamera, *, aperture: Any, focus_distance: Any
+    ) -> "ThinLens":
         """A lens on `camera`.
 
         **Arguments:**
@@ -75,7 +77,7 @@ class ThinLens(eqx.Module):
         f_number: Any | None = None,
         focus_distance: Any,
         pixels_per_unit: Any,
-    ) -> Self:
+    ) -> "ThinLens":
         """A lens from its physical numbers, all lengths in one unit.
 
         **Arguments:**
@@ -115,6 +117,18 @@ class ThinLens(eqx.Module):
             aperture = focal_length / parameter("from_physical(f_number=...)", f_number)
         return cls(aperture, distance, focal_length * distance / margin * scale)
 
+    def _factors(self, depth: Array) -> tuple[Array, Array]:
+        """The lens' factor of the defocus, not negative, and the depth's, which has the sign."""
+        aperture, distance, focal = (
+            x.astype(depth.dtype)
+            for x in (self.aperture, self.focus_distance, self.focal_pixels)
+        )
+        valid = _all_positive(distance, focal) & (aperture >= 0)
+        scale = jnp.where(valid, aperture * focal, jnp.nan)
+        # At depth 0 a zero aperture would give 0 * inf.
+        inverse = 1 / jnp.where((scale == 0) & (depth == 0), 1, depth)
+        return scale, 1 / distance - inverse
+
     def defocus(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Signed diameter of the circle of confusion.
 
@@ -123,18 +137,10 @@ class ThinLens(eqx.Module):
         **Returns:** pixels, in the type of `depth`: negative in front of the focus plane,
         0 on it, `aperture * focal_pixels / focus_distance` at infinity, -inf at depth 0.
 
-        **Gradient:** exact.
+        **Gradient:** exact; not finite at depth 0.
         """
-        depth = jnp.asarray(depth)
-        aperture, distance, focal = (
-            x.astype(depth.dtype)
-            for x in (self.aperture, self.focus_distance, self.focal_pixels)
-        )
-        valid = _all_positive(distance, focal) & (aperture >= 0)
-        scale = jnp.where(valid, aperture * focal, jnp.nan)
-        # At depth 0 a zero aperture would give 0 * inf.
-        inverse = 1 / jnp.where(scale == 0, 1, depth)
-        return scale * (1 / distance - inverse)
+        scale, difference = self._factors(jnp.asarray(depth))
+        return scale * difference
 
     def circle_of_confusion(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Diameter of the circle of confusion: `|defocus(depth)|`.
@@ -145,7 +151,8 @@ class ThinLens(eqx.Module):
 
         **Gradient:** exact; on the focus plane, a kink, the one from behind it.
         """
-        return absolute(self.defocus(depth))
+        scale, difference = self._factors(jnp.asarray(depth))
+        return scale * absolute(difference)
 
 
 @final
@@ -188,6 +195,19 @@ class FocusPlanes(eqx.Module):
         """Depth of the plane in focus, in scene units, under the name that `ThinLens` has."""
         return self.focus
 
+    def _factors(self, depth: Array) -> tuple[Array, Array]:
+        """`max_coc`, and the depth's factor of the defocus, from -1 to 1."""
+        near, focus, far, max_coc = (
+            x.astype(depth.dtype) for x in (self.near, self.focus, self.far, self.max_coc)
+        )
+        valid = _all_positive(focus - near, far - focus) & (max_coc >= 0)
+        # Beyond the planes nothing changes; an infinite quotient would have a NaN derivative.
+        depth = jnp.where(depth < far, jnp.where(depth < near, near, depth), far)
+        ahead = clip01((focus - depth) / (focus - near))
+        behind = clip01((depth - focus) / (far - focus))
+        scale = jnp.where(valid, max_coc, jnp.nan)
+        return scale, jnp.where(depth < focus, -ahead, behind)
+
     def defocus(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Signed diameter of the circle of confusion.
 
@@ -198,15 +218,8 @@ class FocusPlanes(eqx.Module):
 
         **Gradient:** exact, with zero where clamped.
         """
-        depth = jnp.asarray(depth)
-        near, focus, far, max_coc = (
-            x.astype(depth.dtype) for x in (self.near, self.focus, self.far, self.max_coc)
-        )
-        valid = _all_positive(focus - near, far - focus) & (max_coc >= 0)
-        ahead = clip01((focus - depth) / (focus - near))
-        behind = clip01((depth - focus) / (far - focus))
-        scale = jnp.where(valid, max_coc, jnp.nan)
-        return scale * jnp.where(depth < focus, -ahead, behind)
+        scale, ramp = self._factors(jnp.asarray(depth))
+        return scale * ramp
 
     def circle_of_confusion(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Diameter of the circle of confusion: `|defocus(depth)|`.
@@ -217,4 +230,5 @@ class FocusPlanes(eqx.Module):
 
         **Gradient:** exact; on the focus plane, a kink, the one from behind it.
         """
-        return absolute(self.defocus(depth))
+        scale, ramp = self._factors(jnp.asarray(depth))
+        return scale * absolute(ramp)

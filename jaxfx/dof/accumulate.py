@@ -1,0 +1,112 @@
+"""The multi-pass reference: many pinhole pictures through one lens, averaged."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+from tqdm.auto import tqdm
+
+from jaxfx._numerics import safe_sqrt
+from jaxfx.camera import PinholeCamera
+from jaxfx.lens import ThinLens
+
+
+class Accumulation(NamedTuple):
+    """What `accumulate` gives.
+
+    - `image`: height width channel, the mean of all passes, linear radiance.
+    - `convergence`: the root-mean-square difference between the mean of the first half of the
+      passes and the mean of all, in units of radiance; NaN for a single pass.
+    """
+
+    image: Float[Array, "height width channel"]
+    convergence: Float[Array, ""]
+
+
+def accumulate(
+    render: Callable[[PinholeCamera], ArrayLike],
+    camera: PinholeCamera,
+    lens: ThinLens,
+    *,
+    samples: int = 256,
+    jitter: bool = True,
+    seed: int = 0,
+    progress: bool = True,
+) -> Accumulation:
+    """Depth of field by many passes: the mean of pictures from points all over the lens.
+
+    The points cover the disc with equal area, by a low-discrepancy sequence whose every prefix
+    covers it too. All cameras share the plane in focus.
+
+    **Arguments:**
+
+    - `render`: from a camera to an image, height width channel, linear radiance. Anything
+      serves: a rasteriser, a ray tracer, a reprojection of one picture.
+    - `camera`: the pinhole camera at the lens' centre.
+    - `lens`: its `aperture` and `focus_distance` are used, in scene units.
+    - `samples`: how many passes.
+    - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
+      pixel.
+    - `seed`: turns the sequence to another of its kind.
+    - `progress`: show a bar on stderr.
+
+    **Returns:** an `Accumulation`: `image`, height width channel, and `convergence`.
+
+    **Raises:** `ValueError` where `samples` is not a positive integer, the lens is not a
+    `ThinLens`, or a picture changes its shape on the way.
+
+    **Gradient:** that of `render`, through its camera: exact in the aperture, the focus
+    distance and the camera where `render` is. A rasteriser's is zero or missing.
+
+    Source: Haeberli & Akeley 1990, the accumulation buffer. The sequence is Roberts' 2018
+    generalization of the golden ratio to four dimensions.
+    """
+    if not isinstance(lens, ThinLens):
+        raise ValueError(f"`accumulate(lens)` must be a ThinLens, got {type(lens).__name__}.")
+    if not isinstance(samples, int) or samples < 1:
+        raise ValueError(
+            f"`accumulate(samples=...)` must be a positive integer, got {samples}."
+        )
+
+    offsets, shifts = lens_samples(samples, seed)
+    total = half = None
+    for index in tqdm(range(samples), desc="lens", disable=not progress, leave=False):
+        offset = lens.aperture * jnp.asarray(offsets[index], lens.aperture.dtype)
+        eye = camera.through_lens(offset, focus_distance=lens.focus_distance)
+        if jitter:
+            eye = _shifted(eye, shifts[index])
+        image = jnp.asarray(render(eye))
+        if total is not None and image.shape != total.shape:
+            raise ValueError(
+                "`accumulate(render)` must give pictures of one shape, got "
+                f"{total.shape}, then {image.shape}."
+            )
+        total = image if total is None else total + image
+        if index + 1 == samples // 2:
+            half = total / (samples // 2)
+    assert total is not None
+    mean = total / samples
+    if half is None:
+        return Accumulation(mean, jnp.asarray(jnp.nan, mean.dtype))
+    return Accumulation(mean, safe_sqrt(jnp.mean((half - mean) ** 2)))
+
+
+def lens_samples(
+    samples: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "samples 2"], Float[np.ndarray, "samples 2"]]:
+    """Points on a disc of diameter 1, and offsets within a pixel, each in [-1/2, 1/2]."""
+    # The root of x**5 = x + 1: its powers are as far from fractions as four numbers can be.
+    ratio = 1.1673039782614187
+    steps = ratio ** -np.arange(1.0, 5.0)
+    start = np.random.default_rng(seed).random(4) if seed else np.full(4, 0.5)
+    u = (start + np.arange(samples)[:, None] * steps) % 1
+    radius, angle = np.sqrt(u[:, 0]) / 2, 2 * np.pi * u[:, 1]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1), u[:, 2:] - 0.5
+
+
+def _shifted(camera: PinholeCamera, shift: Float[np.ndarray, "2"]) -> PinholeCamera:
+    shift = jnp.asarray(shift, camera.intrinsics.dtype)
+    return PinholeCamera(camera.intrinsics.at[:2, 2].add(shift), camera.world_from_camera)

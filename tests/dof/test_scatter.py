@@ -1,0 +1,417 @@
+"""Scatter against a plain loop, closed forms and finite differences."""
+
+import inspect
+import math
+
+import hypothesis as hyp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxfx import FocusPlanes, ThinLens, dof
+
+
+KERNELS = ("segment_sum", "shift")
+
+
+def row_area(radius, row):
+    """Half the disc's area in a row of pixels, by quadrature."""
+    t = np.linspace(row - 0.5, row + 0.5, 20001)
+    t = (t[1:] + t[:-1]) / 2
+    return np.mean(np.sqrt(np.maximum(radius**2 - t**2, 0)))
+
+
+def loop(image, depth, lens, gamma, epsilon):
+    """The page's equation, sprite by sprite and tap by tap, in float64."""
+    height, width, channels = image.shape
+    aperture, focus, focal = map(float, (lens.aperture, lens.focus_distance, lens.focal_pixels))
+    coc = aperture * focal * np.abs(1 / focus - 1 / depth)
+    sums, weights = np.zeros((height, width, channels)), np.zeros((height, width, 1))
+    clamp = lambda t: min(max(t, 0.0), 1.0)
+    for j in range(height):
+        for i in range(width):
+            radius = max(coc[j, i] / 2, 1e-3)
+            reach = math.ceil(radius + 1)
+            for dy in range(-reach, reach + 1):
+                half = row_area(radius, dy)
+                for dx in range(-reach, reach + 1):
+                    y, x = j + dy, i + dx
+                    if not (0 <= y < height and 0 <= x < width):
+                        continue
+                    covered = max(min(dx + 0.5, half) - max(dx - 0.5, -half), 0)
+                    if depth[j, i] < focus:
+                        k = (focus / depth[j, i]) ** gamma
+                    else:
+                        a = clamp((coc[j, i] - coc[y, x]) / epsilon)
+                        k = 1 - a * (1 - clamp(coc[y, x] / epsilon - 1))
+                    a = k * covered / (math.pi * radius**2)
+                    sums[y, x] += a * image[j, i]
+                    weights[y, x] += a
+    return sums / weights
+
+
+def random_scene(seed, height=9, width=11, channels=3):
+    rng = np.random.default_rng(seed)
+    image = rng.random((height, width, channels))
+    depth = rng.uniform(1.0, 8.0, (height, width))
+    depth[rng.random((height, width)) < 0.2] = np.inf
+    return jnp.asarray(image), jnp.asarray(depth)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_equals_the_loop(kernel):
+    image, depth = random_scene(0)
+    lens = ThinLens(0.1, 2.5, 60.0)
+    expected = loop(np.asarray(image), np.asarray(depth), lens, 1.3, 1.7)
+    result = dof.scatter(image, depth, lens, gamma=1.3, epsilon=1.7, kernel=kernel)
+    # The loop's quadrature is good to about 1e-6.
+    np.testing.assert_allclose(result, expected, atol=5e-6)
+
+
+@hyp.given(st.integers(0, 2**32 - 1), st.floats(0, 3), st.floats(0, 6), st.floats(0.5, 16))
+@hyp.settings(max_examples=20, deadline=None)
+def test_kernels_agree(seed, gamma, epsilon, coc):
+    image, depth = random_scene(seed)
+    lens = ThinLens(0.1, 2.5, 10 * coc)
+    for dtype, tolerance in ((jnp.float64, 1e-10), (jnp.float32, 1e-4)):
+        results = [
+            dof.scatter(
+                image.astype(dtype),
+                depth.astype(dtype),
+                lens,
+                gamma=gamma,
+                epsilon=epsilon,
+                max_coc=12,
+                kernel=kernel,
+            )
+            for kernel in (*KERNELS, "auto")
+        ]
+        for result in results[1:]:
+            assert result.dtype == dtype
+            np.testing.assert_allclose(result, results[0], atol=tolerance)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.3, 0.5, 0.51, 1.0, 1.49, 2.7, 7.9, 20.0, 40.0])
+def test_a_point_of_light_keeps_its_energy_and_place(radius):
+    # All pixels are blurred alike, so the weights sum to 1 away from the frame and the picture
+    # of a point is its sprite.
+    side = 2 * math.ceil(radius) + 5
+    size = 2 * side + 1
+    image = jnp.zeros((size, size, 1)).at[side, side].set(1.0)
+    depth = jnp.full((size, size), jnp.inf)
+    lens = ThinLens(1.0, 1.0, 2 * radius) if radius else ThinLens(0.0, 1.0, 1.0)
+    spread = np.asarray(dof.scatter(image, depth, lens, kernel="shift"))[..., 0]
+    offset = np.arange(size) - side
+    # Where nothing is cut by the frame, the weights are those of a full disc.
+    middle = slice(side - math.ceil(radius) - 1, side + math.ceil(radius) + 2)
+    assert spread[middle, middle].sum() == pytest.approx(spread.sum(), abs=1e-12)
+    frame = np.asarray(dof.scatter(jnp.ones((size, size, 1)), depth, lens, kernel="shift"))
+    np.testing.assert_allclose(frame, 1, atol=1e-12)
+    assert spread.sum() == pytest.approx(1, abs=1e-5)
+    assert abs((spread * offset).sum()) < 1e-3
+    assert abs((spread * offset[:, None]).sum()) < 1e-3
+    second = (spread * (offset**2 + offset[:, None] ** 2)).sum()
+    # A disc's second moment; each of the two axes adds at most a pixel's own, 1/12 and 1/4.
+    assert second - radius**2 / 2 == pytest.approx(0, abs=0.35)
+
+
+def largest_step(spacing):
+    """The largest change of a picture between neighbours of a sweep of the radius, 0 to 2."""
+    image, _ = random_scene(3, 12, 12)
+    depth = jnp.full((12, 12), jnp.inf)
+    radii = jnp.arange(0.0, 2.0 + spacing / 2, spacing)
+    blur = lambda r: dof.scatter(image, depth, ThinLens(1.0, 1.0, 2 * r + 1e-9), max_coc=6)
+    pictures = jax.jit(jax.vmap(blur))(radii)
+    return np.abs(np.diff(pictures, axis=0)).max()
+
+
+def test_radius_zero_to_two_has_no_jump():
+    # A jump stays as it is when the sweep is refined; a slope shrinks with its step.
+    coarse, fine, finest = map(largest_step, (0.05, 0.025, 0.0125))
+    assert 1.7 < coarse / fine < 2.3
+    assert 1.7 < fine / finest < 2.3
+
+
+def test_in_focus_is_the_identity():
+    image, _ = random_scene(4)
+    depth = jnp.full(image.shape[:2], 2.5)
+    np.testing.assert_allclose(
+        dof.scatter(image, depth, ThinLens(0.3, 2.5, 99.0)), image, rtol=1e-15
+    )
+    _, depth = random_scene(4)
+    np.testing.assert_allclose(
+        dof.scatter(image, depth, ThinLens(0.0, 2.5, 99.0), gamma=2.0), image, rtol=1e-15
+    )
+
+
+@hyp.given(st.integers(0, 2**32 - 1), st.floats(0, 3), st.floats(0, 6))
+@hyp.settings(max_examples=10, deadline=None)
+def test_constant_linear_and_mirrored(seed, gamma, epsilon):
+    image, depth = random_scene(seed)
+    other, _ = random_scene(seed + 1)
+    lens = ThinLens(0.1, 2.5, 60.0)
+
+    def blur(image, depth=depth):
+        return dof.scatter(image, depth, lens, gamma=gamma, epsilon=epsilon, max_coc=10)
+
+    np.testing.assert_allclose(blur(jnp.full_like(image, 0.7)), 0.7, atol=1e-12)
+    np.testing.assert_allclose(
+        blur(2 * image + 3 * other), 2 * blur(image) + 3 * blur(other), atol=1e-12
+    )
+    # Not so transposed: the rim is exact by rows.
+    for flip in (jnp.fliplr, jnp.flipud):
+        np.testing.assert_allclose(
+            blur(flip(image), flip(depth)), flip(blur(image)), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 7, 3), (7, 1, 4), (13, 5, 2)])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_any_size(shape, kernel):
+    image, depth = random_scene(5, *shape)
+    lens = ThinLens(0.1, 2.5, 200.0)
+    result = dof.scatter(image, depth, lens, kernel=kernel)
+    np.testing.assert_allclose(
+        result, dof.scatter(image, depth, lens, kernel="segment_sum"), atol=1e-12
+    )
+    assert np.isfinite(result).all()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_bad_pixel_spoils_what_it_can_reach_and_no_more(kernel):
+    image, depth = random_scene(6, 31, 31)
+    depth = jnp.full_like(depth, 5.0)
+    lens = ThinLens(0.1, 2.5, 200.0)  # C = 4, so two pixels and a half
+    good = dof.scatter(image, depth, lens, max_coc=8, kernel=kernel)
+    rows, columns = np.mgrid[:31, :31] - 15
+    blur = jax.jit(lambda i, d: dof.scatter(i, d, lens, max_coc=8, kernel=kernel))
+    for bad in (jnp.nan, jnp.inf, -jnp.inf):
+        result = blur(image.at[15, 15, 1].set(bad), depth)
+        spoiled = np.isnan(result).all(axis=-1)
+        assert spoiled[15, 15]
+        assert not spoiled[np.hypot(rows, columns) > 2 + np.sqrt(0.5)].any()
+        lost = np.hypot(rows, columns) > 5
+        np.testing.assert_allclose(result[lost], good[lost], atol=1e-12)
+    result = blur(image, depth.at[15, 15].set(jnp.nan))
+    assert not np.isnan(result[np.hypot(rows, columns) > 4 + np.sqrt(0.5)]).any()
+
+
+def test_indicator_costs_energy_that_area_keeps():
+    """What the paper's coverage loses: its sum over pixels jumps about the disc's area."""
+    radius = np.arange(0.6, 4.0, 0.05)
+    side = np.mgrid[-5:6, -5:6]
+    error = [
+        abs((side[0] ** 2 + side[1] ** 2 <= r * r).sum() / (math.pi * r * r) - 1)
+        for r in radius
+    ]
+    assert max(error) > 0.3
+    image, depth = random_scene(7)
+    lens = ThinLens(0.1, 2.5, 60.0)
+    options = {"gamma": 1.0, "max_coc": 8, "kernel": "segment_sum"}
+    area = dof.scatter(image, depth, lens, **options)
+    indicator = dof.scatter(image, depth, lens, coverage="indicator", **options)
+    difference = np.abs(area - indicator).max()
+    assert 0.1 < difference < 1
+
+
+def differences(function, x, step=1e-6):
+    return np.asarray((function(x + step) - function(x - step)) / (2 * step))
+
+
+def parameters_of(depth_shape):
+    lens = ThinLens(0.1, 2.5, 60.0)
+    return {
+        "aperture": lens.aperture,
+        "focus_distance": lens.focus_distance,
+        "focal_pixels": lens.focal_pixels,
+        "gamma": jnp.asarray(1.3),
+        "epsilon": jnp.asarray(1.7),
+    }
+
+
+def picture(values, image, depth, kernel):
+    lens = ThinLens(values["aperture"], values["focus_distance"], values["focal_pixels"])
+    return dof.scatter(
+        image,
+        depth,
+        lens,
+        gamma=values["gamma"],
+        epsilon=values["epsilon"],
+        max_coc=12,
+        kernel=kernel,
+    )
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(
+    "name", ["aperture", "focus_distance", "focal_pixels", "gamma", "epsilon"]
+)
+def test_gradients_of_parameters(kernel, name):
+    image, depth = random_scene(8)
+    values = parameters_of(depth.shape)
+    weight = jnp.asarray(np.random.default_rng(9).normal(size=image.shape))
+
+    @jax.jit
+    def loss(x):
+        return jnp.sum(weight * picture(values | {name: x}, image, depth, kernel))
+
+    expected = differences(loss, values[name])
+    assert abs(expected) > 1e-3
+    forward = jax.jvp(loss, (values[name],), (jnp.ones(()),))[1]
+    reverse = jax.grad(loss)(values[name])
+    assert forward == pytest.approx(expected, rel=1e-6)
+    assert reverse == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("which", ["image", "depth"])
+def test_gradients_of_images(kernel, which):
+    rng = np.random.default_rng(10)
+    image, depth = random_scene(11)
+    # Equal depths stand at a kink of the leak rejection.
+    depth = jnp.asarray(rng.uniform(1.0, 8.0, depth.shape))
+    values = parameters_of(depth.shape)
+    weight = jnp.asarray(rng.normal(size=image.shape))
+    inputs = {"image": image, "depth": depth}
+    direction = jnp.asarray(rng.normal(size=inputs[which].shape))
+
+    @jax.jit
+    def loss(x):
+        given = inputs | {which: x}
+        return jnp.sum(weight * picture(values, given["image"], given["depth"], kernel))
+
+    expected = differences(lambda t: loss(inputs[which] + t * direction), 0.0)
+    forward = jax.jvp(loss, (inputs[which],), (direction,))[1]
+    reverse = jnp.vdot(jax.grad(loss)(inputs[which]), direction)
+    assert forward == pytest.approx(expected, rel=1e-6)
+    assert reverse == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", ["aperture", "focus_distance"])
+def test_gradient_at_a_silhouette(kernel, name):
+    """Two flat-coloured planes, the near one before half of the far one: where path tracers'
+    thin lenses return zero."""
+    image = jnp.concatenate([jnp.full((15, 8, 3), 0.9), jnp.full((15, 9, 3), 0.1)], axis=1)
+    depth = jnp.concatenate([jnp.full((15, 8), 1.6), jnp.full((15, 9), 4.1)], axis=1)
+    values = parameters_of(depth.shape)
+
+    def edge(x):
+        return picture(values | {name: x}, image, depth, kernel)[7, 5:12]
+
+    expected = differences(edge, values[name], 1e-5)
+    assert np.abs(expected).max() > 1e-2
+    derivative = jax.jvp(edge, (values[name],), (jnp.ones(()),))[1]
+    np.testing.assert_allclose(derivative, expected, rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(jax.jacrev(edge)(values[name]), derivative, atol=1e-10)
+
+
+DEGENERATE = {
+    "in focus": {"depth": 2.5},
+    "epsilon 0": {"epsilon": 0.0},
+    "gamma 0": {"gamma": 0.0},
+    "gamma large": {"gamma": 80.0},
+    "at infinity": {"depth": jnp.inf},
+    "aperture 0": {"aperture": 0.0},
+    "very near": {"depth": 1e-6},
+}
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("case", DEGENERATE)
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
+    image, depth = random_scene(12)
+    change = dict(DEGENERATE[case])
+    if "depth" in change:
+        depth = depth.at[:, 3:].set(change.pop("depth"))
+    values = parameters_of(depth.shape) | {k: jnp.asarray(v) for k, v in change.items()}
+    values = jax.tree.map(lambda x: x.astype(dtype), values)
+    image, depth = image.astype(dtype), depth.astype(dtype)
+
+    def loss(values, image, depth):
+        return jnp.sum(picture(values, image, depth, kernel) ** 2)
+
+    value, gradients = jax.value_and_grad(loss, argnums=(0, 1, 2))(values, image, depth)
+    assert np.isfinite(value)
+    for leaf in jax.tree.leaves(gradients):
+        assert np.isfinite(leaf).all()
+    ones = jax.tree.map(jnp.ones_like, (values, image, depth))
+    assert np.isfinite(jax.jvp(loss, (values, image, depth), ones)[1])
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_second_derivatives(kernel):
+    image, depth = random_scene(13)
+    values = parameters_of(depth.shape)
+    names = ("aperture", "focus_distance", "gamma", "epsilon")
+
+    def loss(x):
+        given = dict(zip(names, x, strict=True))
+        return jnp.mean((picture(values | given, image, depth, kernel) - image) ** 2)
+
+    x = jnp.stack([values[name] for name in names])
+    hessian = jax.jit(jax.jacfwd(jax.jacrev(loss)))(x)
+    gradient = jax.jit(jax.grad(loss))
+    expected = jnp.stack(
+        [differences(lambda t, e=e: gradient(x + t * e), 0.0) for e in jnp.eye(4)]
+    )
+    np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-10)
+
+
+def test_half_images_keep_their_type():
+    image, depth = random_scene(14)
+    lens = ThinLens(0.1, 2.5, 60.0)
+    result = dof.scatter(image.astype(jnp.float16), depth.astype(jnp.float32), lens)
+    assert result.dtype == jnp.float16
+    np.testing.assert_allclose(result, dof.scatter(image, depth, lens), atol=2e-3)
+
+
+def test_focus_planes_are_a_lens():
+    image, depth = random_scene(15)
+    planes = FocusPlanes(1.0, 2.5, 8.0, 6.0)
+    results = [dof.scatter(image, depth, planes, gamma=1.0, kernel=k) for k in KERNELS]
+    np.testing.assert_allclose(results[0], results[1], atol=1e-12)
+    assert np.abs(results[0] - image).max() > 0.1
+
+
+BAD = {
+    "image": ({"image": jnp.zeros((4, 5))}, "scatter\\(image\\).*(height, width, channel)"),
+    "integers": ({"image": jnp.zeros((4, 5, 3), int)}, "scatter\\(image\\).*floats.*int64"),
+    "depth shape": ({"depth": jnp.ones((5, 4))}, "scatter\\(depth\\).*\\(4, 5\\).*\\(5, 4\\)"),
+    "depth 0": ({"depth": jnp.zeros((4, 5))}, "scatter\\(depth\\).*positive.*0.0 at row 0"),
+    "depth nan": ({"depth": jnp.full((4, 5), jnp.nan)}, "scatter\\(depth\\).*nan"),
+    "gamma": ({"gamma": -1.0}, "scatter\\(gamma=...\\)"),
+    "epsilon": ({"epsilon": -1.0}, "scatter\\(epsilon=...\\)"),
+    "max_coc": ({"max_coc": -3}, "scatter\\(max_coc=...\\).*positive, got -3"),
+    "kernel": ({"kernel": "best"}, "scatter\\(kernel=...\\).*segment_sum.*'best'"),
+    "coverage": ({"coverage": "round"}, "scatter\\(coverage=...\\).*area.*'round'"),
+    "indicator": ({"coverage": "indicator", "kernel": "shift"}, "segment_sum"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    change, message = BAD[case]
+    arguments = {"image": jnp.ones((4, 5, 3)), "depth": jnp.ones((4, 5))} | change
+    # The bare function: under test, jaxtyping would find a wrong shape first.
+    with pytest.raises(ValueError, match=message):
+        inspect.unwrap(dof.scatter)(**arguments, lens=ThinLens(0.1, 2.5, 60.0))
+
+
+def test_max_coc_is_asked_for_under_transforms():
+    image, depth = random_scene(16)
+    lens = ThinLens(0.1, 2.5, 60.0)
+    with pytest.raises(ValueError, match="max_coc=.*under `jit`"):
+        jax.jit(dof.scatter)(image, depth, lens)
+    with pytest.raises(ValueError, match="max_coc=.*under `jit`"):
+        jax.grad(lambda a: dof.scatter(image, depth, ThinLens(a, 2.5, 60.0)).sum())(0.1)
+
+
+def test_a_traced_bad_lens_gives_nan():
+    image, depth = random_scene(17)
+    blur = jax.jit(lambda a: dof.scatter(image, depth, ThinLens(a, 2.5, 60.0), max_coc=4))
+    assert np.isnan(blur(-0.1)).all()
+    assert np.isfinite(blur(0.1)).all()
