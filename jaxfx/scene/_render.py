@@ -1,0 +1,196 @@
+"""The public calls: a scene and a camera to a deep frame buffer, depth, or object ids."""
+
+import functools
+import logging
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.gbuffer import GBuffer
+from jaxfx.scene import _embree, _opengl
+from jaxfx.scene._scene import Scene
+from jaxfx.scene._surface import Hits, depth_image, intersect, to_gbuffer
+from jaxfx.scene._view import View, check_size
+
+
+_logger = logging.getLogger("jaxfx.scene")
+_Camera = PinholeCamera | OrthographicCamera
+_FirstFaces = Callable[[Scene, View, np.ndarray], np.ndarray]
+_BACKENDS = {"opengl": _opengl, "embree": _embree}
+_GAP = 1e-5  # between layers, of their depth and of the scene's scale
+
+
+def gbuffer(
+    scene: Scene,
+    camera: _Camera,
+    *,
+    height: int,
+    width: int,
+    backend: str = "auto",
+    layer: int = 0,
+) -> GBuffer:
+    """The deep frame buffer of a scene: what each pixel's centre shows, not antialiased.
+
+    Base colour is texture x factor x vertex colour in linear light. `ambient` is the base
+    colour, `diffuse` base * (1 - metallic), `specular` the mix of 0.04 and base by metallic.
+    The shader is Lambert where a surface is rough and no metal, Blinn elsewhere. Normals face
+    the camera, whichever side of a face is seen.
+
+    **Arguments:**
+
+    - `scene`: from `load`, `from_trimesh` or `still_life`.
+    - `camera`: a `PinholeCamera`, with any intrinsics, or an `OrthographicCamera`.
+    - `height`, `width`: image size in pixels.
+    - `backend`: "opengl" rasterises; "embree" casts rays; "auto" takes OpenGL where it works
+      and else Embree, and tells the logger `jaxfx.scene` which.
+    - `layer`: 0 is what the camera sees; 1 the next surface behind it that shows its front
+      (its corners counter-clockwise), and so on. Surfaces closer together than some 1e-5 of
+      their depth and of the scene's size may count as one.
+
+    **Returns:** a `GBuffer` of float32. Pixels that show nothing have depth inf, shader -1 and
+    zeros.
+
+    **Raises:** `ValueError` for arguments out of range, and where layer 0 shows nothing at
+    all; `RuntimeError` where the backend does not work on this machine.
+
+    **Gradient:** none, with respect to the camera or anything else: this runs on the host,
+    outside every transform.
+    """
+    height, width = check_size("gbuffer", height, width)
+    view = View.of(camera, "scene.gbuffer")
+    hits = _visible("gbuffer", scene, view, height, width, backend, layer)
+    if layer == 0 and len(hits.pixel) == 0:
+        raise ValueError(
+            "`scene.gbuffer(camera)` must see the scene, got nothing in view: the scene lies "
+            f"about {np.round(scene.centre, 3).tolist()}, "
+            f"{np.round(scene.extent, 3).tolist()} in size."
+        )
+    return to_gbuffer(scene, view, hits, height, width)
+
+
+def depth(
+    scene: Scene,
+    camera: _Camera,
+    *,
+    height: int,
+    width: int,
+    backend: str = "auto",
+    layer: int = 0,
+) -> Float[Array, "height width"]:
+    """The depth along the optical axis of what each pixel's centre shows: a shadow map, say.
+
+    **Arguments:** as in `gbuffer`.
+
+    **Returns:** height width, float32, scene units; inf where there is nothing.
+
+    **Raises:** as `gbuffer`, but for a camera that sees nothing: all is inf then.
+
+    **Gradient:** none: this runs on the host, outside every transform.
+    """
+    height, width = check_size("depth", height, width)
+    view = View.of(camera, "scene.depth")
+    hits = _visible("depth", scene, view, height, width, backend, layer)
+    return jnp.asarray(depth_image(hits, height, width))
+
+
+def object_ids(
+    scene: Scene,
+    camera: _Camera,
+    *,
+    height: int,
+    width: int,
+    backend: str = "auto",
+    layer: int = 0,
+) -> Int[Array, "height width"]:
+    """Which object each pixel's centre shows, as an index into `scene.names`.
+
+    **Arguments:** as in `gbuffer`.
+
+    **Returns:** height width, int32; -1 where there is nothing.
+
+    **Raises:** as `depth`.
+
+    **Gradient:** none: these are integers.
+    """
+    height, width = check_size("object_ids", height, width)
+    view = View.of(camera, "scene.object_ids")
+    hits = _visible("object_ids", scene, view, height, width, backend, layer)
+    ids = np.full(height * width, -1, np.int32)
+    ids[hits.pixel] = scene.face_objects[hits.face]
+    return jnp.asarray(ids.reshape(height, width))
+
+
+def _visible(
+    caller: str, scene: Scene, view: View, height: int, width: int, backend: str, layer: int
+) -> Hits:
+    """What the camera sees of layer `layer`."""
+    if not isinstance(scene, Scene):
+        raise ValueError(
+            f"`scene.{caller}(scene)` must be a Scene, got {type(scene).__name__}."
+        )
+    if isinstance(layer, bool) or not hasattr(layer, "__index__") or layer < 0:
+        raise ValueError(
+            f"`scene.{caller}(layer=...)` must be an integer from 0, got {layer!r}."
+        )
+    first_faces = _backend(caller, backend)
+    hits = intersect(scene, view, first_faces(scene, view, np.zeros((height, width))))
+    for _ in range(layer):
+        faces = _next_faces(first_faces, scene, view, hits, (height, width))
+        hits = intersect(scene, view, faces)
+    return hits
+
+
+def _next_faces(
+    first_faces: _FirstFaces, scene: Scene, view: View, hits: Hits, shape: tuple[int, int]
+) -> Int[np.ndarray, "height width"]:
+    """The next faces behind `hits` that show their front.
+
+    A ray that meets a back goes on from there. One that does not get past where it started,
+    for rounding, starts farther on each time.
+    """
+    found = np.full(shape, -1, np.int32)
+    gap = np.full(shape, _GAP)
+    behind = np.full(shape, np.inf)
+    behind.flat[hits.pixel] = hits.depth
+    while np.isfinite(behind).any():
+        start = behind + gap * (behind + scene.scale)
+        met = intersect(scene, view, first_faces(scene, view, start))
+        passed = met.depth > start.flat[met.pixel]
+        done = passed & met.front
+        found.flat[met.pixel[done]] = met.face[done]
+        gap.flat[met.pixel[~passed]] *= 2
+        behind = np.full(shape, np.inf)
+        behind.flat[met.pixel[~done]] = np.maximum(met.depth, start.flat[met.pixel])[~done]
+    return found
+
+
+def _backend(caller: str, name: str) -> _FirstFaces:
+    if name == "auto":
+        name = _automatic()
+    if name not in _BACKENDS:
+        raise ValueError(
+            f'`scene.{caller}(backend=...)` must be "auto", "opengl" or "embree", got {name!r}.'
+        )
+    problem = _BACKENDS[name].problem()
+    if problem:
+        raise RuntimeError(
+            f'`scene.{caller}(backend="{name}")` does not work on this machine: {problem}'
+        )
+    return _BACKENDS[name].first_faces
+
+
+@functools.cache
+def _automatic() -> str:
+    """OpenGL where it works, else Embree; said once."""
+    problems = {}
+    for name, module in _BACKENDS.items():
+        problems[name] = module.problem()
+        if problems[name] is None:
+            refused = "".join(f" ({key}: {why})" for key, why in problems.items() if why)
+            _logger.info("scenes are rendered with %s%s", name, refused)
+            return name
+    reasons = "; ".join(f"{name}: {why}" for name, why in problems.items())
+    raise RuntimeError(f"no backend of `jaxfx.scene` works on this machine: {reasons}.")

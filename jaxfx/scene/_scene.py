@@ -1,0 +1,184 @@
+"""A scene: triangles with their attributes and materials, as NumPy arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, final
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What a surface is made of, in the terms of glTF 2.0.
+
+    **Arguments:**
+
+    - `color`: linear RGB; the corners' colours and the texture multiply it.
+    - `texture`: height width 3, sRGB bytes, row 0 at the top; or None.
+    - `metallic`, `roughness`: in [0, 1].
+    - `metallic_roughness`: height width 3, linear bytes that multiply the two: roughness in
+      green, metallic in blue; or None.
+
+    **Raises:** `ValueError` for a number out of range or another kind of picture.
+
+    **Gradient:** none: these are the host's numbers.
+    """
+
+    color: Sequence[float | int] = (1.0, 1.0, 1.0)
+    texture: UInt8[np.ndarray, "height width 3"] | None = None
+    metallic: float | int = 0.0
+    roughness: float | int = 1.0
+    metallic_roughness: UInt8[np.ndarray, "rows columns 3"] | None = None
+
+    def __post_init__(self):
+        if np.shape(self.color) != (3,) or not np.isfinite(self.color).all():
+            raise ValueError(f"`Material(color=...)` must be linear RGB, got {self.color}.")
+        for name in ("metallic", "roughness"):
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"`Material({name}=...)` must be in [0, 1], got {value}.")
+        for name in ("texture", "metallic_roughness"):
+            picture = getattr(self, name)
+            if picture is None:
+                continue
+            shape, dtype = np.shape(picture), np.asarray(picture).dtype
+            if len(shape) != 3 or shape[2] != 3 or 0 in shape or dtype != np.uint8:
+                raise ValueError(
+                    f"`Material({name}=...)` must hold bytes of shape (height, width, 3), "
+                    f"got {dtype} of shape {shape}."
+                )
+
+
+class Viewpoint(NamedTuple):
+    """Where a scene is seen well from.
+
+    **Arguments:**
+
+    - `eye`, `target`: world positions, 3.
+    - `fov`: the field of view of the picture's shorter side, in radians.
+
+    **Gradient:** none.
+    """
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    fov: float
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Scene:
+    """Triangles in world space, with what their surfaces look like.
+
+    World axes are the mesh file's own (y up in most of them). The arrays are copied and
+    read-only, for the backends keep what they build from them.
+
+    **Arguments:**
+
+    - `vertices`: vertex 3, world positions, in scene units.
+    - `faces`: face 3, indices of vertices; counter-clockwise seen from the front.
+    - `normals`: face 3 3, each corner's normal, in world space. Their sign does not matter.
+    - `uv`: face 3 2, each corner's texture coordinates; v points up, whole numbers repeat.
+    - `colors`: face 3 3, each corner's linear RGB, which multiplies the material's.
+    - `materials`, `face_materials`: the materials, and every face's index into them.
+    - `names`, `face_objects`: the objects' names, and every face's index into them.
+    - `viewpoint`: what `default_camera` takes, where the scene knows better than its box.
+
+    **Raises:** `ValueError` where there is no triangle, a vertex is not finite, or the arrays
+    do not fit one another.
+
+    **Gradient:** none: scenes live on the host, in NumPy.
+    """
+
+    vertices: Float[np.ndarray, "vertex 3"]
+    faces: Int[np.ndarray, "face 3"]
+    normals: Float[np.ndarray, "face 3 3"]
+    uv: Float[np.ndarray, "face 3 2"]
+    colors: Float[np.ndarray, "face 3 3"]
+    materials: tuple[Material, ...]
+    face_materials: Int[np.ndarray, " face"]
+    names: tuple[str, ...]
+    face_objects: Int[np.ndarray, " face"]
+    viewpoint: Viewpoint | None = None
+
+    def __post_init__(self):
+        count = len(self.faces)
+        if count == 0:
+            raise ValueError("`Scene(faces=...)` must hold at least one triangle, got none.")
+        for name, (shape, dtype) in {
+            "vertices": ((len(self.vertices), 3), np.float64),
+            "faces": ((count, 3), np.int32),
+            "normals": ((count, 3, 3), np.float32),
+            "uv": ((count, 3, 2), np.float32),
+            "colors": ((count, 3, 3), np.float32),
+            "face_materials": ((count,), np.int32),
+            "face_objects": ((count,), np.int32),
+        }.items():
+            value = getattr(self, name)
+            if np.shape(value) != shape:
+                raise ValueError(
+                    f"`Scene({name}=...)` must have shape {shape}, got {np.shape(value)}."
+                )
+            copied = np.array(value, dtype, order="C")
+            copied.flags.writeable = False
+            object.__setattr__(self, name, copied)
+        self._require_index("faces", len(self.vertices))
+        self._require_index("face_materials", len(self.materials))
+        self._require_index("face_objects", len(self.names))
+        wrong = ~np.isfinite(self.vertices).all(axis=1)
+        if wrong.any():
+            raise ValueError(
+                f"`Scene(vertices=...)` must be finite, got {self.vertices[wrong][0]} at "
+                f"vertex {wrong.argmax()}; {wrong.sum()} of {wrong.size} are wrong."
+            )
+
+    def _require_index(self, name: str, count: int) -> None:
+        value = getattr(self, name)
+        if value.min() < 0 or value.max() >= count:
+            raise ValueError(
+                f"`Scene({name}=...)` must be indices in [0, {count}), "
+                f"got {value.min()} to {value.max()}."
+            )
+
+    def __repr__(self) -> str:
+        sides = " x ".join(f"{side:.4g}" for side in self.extent)
+        return f"Scene({len(self.faces)} triangles, {len(self.names)} objects, {sides})"
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "point 3"]:
+        """The vertices that a face uses: point 3."""
+        return self.vertices[np.unique(self.faces)]
+
+    @cached_property
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The smallest and the largest coordinates of the triangles: 2 3."""
+        points = self.points
+        return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    @property
+    def centre(self) -> Float[np.ndarray, "3"]:
+        """The middle of the bounding box: 3, a world position."""
+        return self.bounds.mean(axis=0)
+
+    @property
+    def extent(self) -> Float[np.ndarray, "3"]:
+        """The sides of the bounding box: 3, in scene units."""
+        return self.bounds[1] - self.bounds[0]
+
+    @property
+    def scale(self) -> float:
+        """Half the bounding box's diagonal, in scene units; 1 for a box of a single point."""
+        return float(np.linalg.norm(self.extent)) / 2 or 1.0
+
+    @cached_property
+    def unit_triangles(self) -> Float[np.ndarray, "face 3 3"]:
+        """The corners, face 3 3 in float32, moved and scaled into the ball of radius 1 about 0.
+
+        Visibility is decided on these, so that float32 is as good for a scene far from the
+        origin or very small as for any other.
+        """
+        unit = (self.vertices - self.centre) / self.scale
+        return np.ascontiguousarray(unit.astype(np.float32)[self.faces])

@@ -1,0 +1,179 @@
+"""From the face that a pixel shows to what the surface is like there.
+
+Both backends answer one question only, which face a pixel shows. Depth, normals, textures and
+materials follow here, in float64 where it matters, so that the backends agree wherever they
+see the same face.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxfx.gbuffer import GBuffer
+from jaxfx.scene._color import LINEAR, SRGB, read_texture
+from jaxfx.scene._scene import Scene
+from jaxfx.scene._view import View
+
+
+_DIELECTRIC = 0.04  # reflectance of a surface of refractive index 1.5, face on
+_SLACK = 0.05  # how far outside a face depth may be read, in barycentric weight
+
+
+class Hits(NamedTuple):
+    """The pixels that show a face, and where on it they look.
+
+    `pixel` is a flat index; `weights` are barycentric, inside the face; `normal` is the face's,
+    unit, on its front; `toward` is the ray's direction. Both are in camera space.
+    """
+
+    pixel: Int[np.ndarray, " hit"]
+    face: Int[np.ndarray, " hit"]
+    depth: Float[np.ndarray, " hit"]
+    weights: Float[np.ndarray, "3 hit"]
+    normal: Float[np.ndarray, "3 hit"]
+    toward: Float[np.ndarray, "3 hit"]
+
+    @property
+    def front(self) -> Bool[np.ndarray, " hit"]:
+        """Whether the camera sees the face's front, counter-clockwise."""
+        return _dot(self.normal, self.toward) < 0
+
+
+def intersect(scene: Scene, view: View, faces: Int[np.ndarray, "height width"]) -> Hits:
+    """Meet every pixel's ray with its own face (-1 for none).
+
+    A rasteriser snaps corners to some 1/256 pixel, and may so give a pixel to a face that its
+    centre just misses. Depth then follows the face's plane, `_SLACK` of the face beyond it and
+    no farther: a face seen edge-on would put the pixel anywhere.
+
+    Source: Möller & Trumbore 1997.
+    """
+    pixel = np.flatnonzero(faces >= 0)
+    face = faces.take(pixel)
+    origin, toward = (each.take(pixel, axis=1) for each in view.rays(*faces.shape))
+    corners = view.to_camera(scene.vertices)
+    a, b, c = (corners.take(scene.faces[:, i].take(face), axis=1) for i in range(3))
+    ab, ac, offset = b - a, c - a, origin - a
+    normal = _cross(ab, ac)
+    volume = -_dot(normal, toward)
+    volume = np.where(volume == 0, np.inf, volume)
+    swept = _cross(offset, toward)
+    weight_b = _dot(ac, swept) / volume
+    weight_c = -_dot(ab, swept) / volume
+    weights = np.stack([1 - weight_b - weight_c, weight_b, weight_c])
+    depth = _dot(_at_least(-_SLACK, weights), (a[2], b[2], c[2]))
+    return Hits(pixel, face, depth, _at_least(0, weights), _unit(normal), toward)
+
+
+def _at_least(
+    least: float | int, weights: Float[np.ndarray, "3 hit"]
+) -> Float[np.ndarray, "3 hit"]:
+    weights = np.maximum(weights, least)
+    return weights / weights.sum(axis=0)
+
+
+def to_gbuffer(scene: Scene, view: View, hits: Hits, height: int, width: int) -> GBuffer:
+    """The deep frame buffer of the hits; nothing elsewhere."""
+    color, metallic, roughness = _materials(scene, hits)
+    bare = (1 - metallic)[:, None]
+    specular = _DIELECTRIC * bare + color * metallic[:, None]
+    shader = np.where((roughness < 1) | (metallic > 0), np.int32(2), np.int32(0))
+    image = partial(_image, hits.pixel, (height, width))
+    base = image(color, 0)
+    return GBuffer(
+        color=base,
+        shader=image(shader, -1),
+        ambient=base,
+        diffuse=image(color * bare, 0),
+        specular=image(specular, 0),
+        normal=image(_normals(scene, view, hits).T, 0),
+        depth=depth_image(hits, height, width),
+        roughness=image(roughness, 0),
+    )
+
+
+def depth_image(hits: Hits, height: int, width: int) -> Float[np.ndarray, "height width"]:
+    """The hits' depth in float32, inf elsewhere."""
+    return _image(hits.pixel, (height, width), hits.depth.astype(np.float32), np.inf)
+
+
+def _image(
+    pixel: Int[np.ndarray, " hit"],
+    shape: tuple[int, int],
+    values: np.ndarray,
+    nothing: int | float,
+) -> np.ndarray:
+    """`values` at the flat indices `pixel` of an image, `nothing` elsewhere."""
+    full = np.full((shape[0] * shape[1], *values.shape[1:]), nothing, values.dtype)
+    full[pixel] = values
+    return full.reshape(*shape, *values.shape[1:])
+
+
+def _normals(scene: Scene, view: View, hits: Hits) -> Float[np.ndarray, "3 hit"]:
+    """Unit normals in world space that face the camera.
+
+    Interpolated ones are turned to the side of the face that is seen. Where they still look
+    away, as at a silhouette, they lose what they have along the ray.
+    """
+    flat = view.turn(hits.normal * np.where(hits.front, 1, -1)).astype(np.float32)
+    toward = view.turn(_unit(hits.toward)).astype(np.float32)
+    normal = _interpolate(scene.normals, hits.face, hits.weights)
+    normal *= np.where(_dot(normal, flat) < 0, np.float32(-1), np.float32(1))
+    normal = _unit(np.where((normal == 0).all(axis=0), flat, normal))
+    return _unit(normal - np.maximum(_dot(normal, toward), 0) * toward)
+
+
+def _materials(
+    scene: Scene, hits: Hits
+) -> tuple[Float[np.ndarray, "hit 3"], Float[np.ndarray, " hit"], Float[np.ndarray, " hit"]]:
+    """Base colour, metallic and roughness of every hit, in float32."""
+    color = _interpolate(scene.colors, hits.face, hits.weights).T
+    uv = _interpolate(scene.uv, hits.face, hits.weights).T
+    metallic = np.empty(len(color), np.float32)
+    roughness = np.empty(len(color), np.float32)
+    index = scene.face_materials.take(hits.face)
+    for each in np.unique(index):
+        material = scene.materials[each]
+        at = np.flatnonzero(index == each)
+        factor = np.array(material.color, np.float32)
+        metallic[at], roughness[at] = material.metallic, material.roughness
+        if material.texture is not None:
+            factor = factor * read_texture(material.texture, uv[at], SRGB)
+        if material.metallic_roughness is not None:
+            both = read_texture(material.metallic_roughness, uv[at], LINEAR)
+            roughness[at] *= both[:, 1]
+            metallic[at] *= both[:, 2]
+        color[at] *= factor
+    return color, metallic, roughness
+
+
+def _interpolate(
+    corners: Float[np.ndarray, "face 3 value"],
+    face: Int[np.ndarray, " hit"],
+    weights: Float[np.ndarray, "3 hit"],
+) -> Float[np.ndarray, "value hit"]:
+    """The corners' values at the hits, in float32."""
+    return np.einsum("in,nik->kn", weights.astype(np.float32), corners.take(face, axis=0))
+
+
+def _dot(a: Sequence[Any] | np.ndarray, b: Sequence[Any] | np.ndarray) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(
+    a: Float[np.ndarray, "3 hit"], b: Float[np.ndarray, "3 hit"]
+) -> Float[np.ndarray, "3 hit"]:
+    return np.stack(
+        [
+            a[1] * b[2] - a[2] * b[1],
+            a[2] * b[0] - a[0] * b[2],
+            a[0] * b[1] - a[1] * b[0],
+        ]
+    )
+
+
+def _unit(vector: Float[np.ndarray, "3 hit"]) -> Float[np.ndarray, "3 hit"]:
+    return vector / np.sqrt(_dot(vector, vector))
