@@ -9,18 +9,23 @@ from jaxtyping import Array, Float
 from jaxfx._numerics import check, normalize, parameter
 
 
+def _each(vector: Float[Array, " n"], like: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """`vector` for every one of `like`'s."""
+    return jnp.broadcast_to(vector.astype(like.dtype), like.shape)
+
+
 def _to_world(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
     pose = world_from_camera.astype(points.dtype)
-    return points @ pose[:3, :3].T + pose[:3, 3]
+    return points @ pose[:3, :3].T + _each(pose[:3, 3], points)
 
 
 def _to_camera(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
     pose = world_from_camera.astype(points.dtype)
-    return (points - pose[:3, 3]) @ pose[:3, :3]
+    return (points - _each(pose[:3, 3], points)) @ pose[:3, :3]
 
 
 def _look_at_pose(eye: Any, target: Any, up: Any) -> Float[Array, "4 4"]:
@@ -222,9 +227,8 @@ class OrthographicCamera(eqx.Module):
         """
         points = jnp.asarray(points)
         local = _to_camera(self.world_from_camera, points)
-        scale, centre = self.pixels_per_unit, self.centre
-        pixels = local[..., :2] * scale.astype(points.dtype) + centre.astype(points.dtype)
-        return pixels, local[..., 2]
+        pixels = local[..., :2] * self.pixels_per_unit.astype(points.dtype)
+        return pixels + _each(self.centre, pixels), local[..., 2]
 
     def unproject(
         self, pixels: Float[Array, "... 2"], depth: Float[Array, "..."]
@@ -238,7 +242,7 @@ class OrthographicCamera(eqx.Module):
         **Gradient:** exact.
         """
         pixels, depth = jnp.asarray(pixels), jnp.asarray(depth)
-        scale, centre = self.pixels_per_unit, self.centre
-        plane = (pixels - centre.astype(pixels.dtype)) / scale.astype(pixels.dtype)
+        plane = pixels - _each(self.centre, pixels)
+        plane = plane / self.pixels_per_unit.astype(pixels.dtype)
         local = jnp.concatenate([plane, depth[..., None]], axis=-1)
         return _to_world(self.world_from_camera, local)

@@ -118,7 +118,7 @@ class ThinLens(eqx.Module):
         return cls(aperture, distance, focal_length * distance / margin * scale)
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
-        """The lens' factor of the defocus, not negative, and the depth's, which has the sign."""
+        """The lens' factor of the defocus, never negative, and the depth's, with the sign."""
         aperture, distance, focal = (
             x.astype(depth.dtype)
             for x in (self.aperture, self.focus_distance, self.focal_pixels)
@@ -202,7 +202,7 @@ class FocusPlanes(eqx.Module):
         )
         valid = _all_positive(focus - near, far - focus) & (max_coc >= 0)
         # Beyond the planes nothing changes; an infinite quotient would have a NaN derivative.
-        depth = jnp.where(depth < far, jnp.where(depth < near, near, depth), far)
+        depth = jnp.where(depth >= far, far, jnp.where(depth <= near, near, depth))
         ahead = clip01((focus - depth) / (focus - near))
         behind = clip01((depth - focus) / (far - focus))
         scale = jnp.where(valid, max_coc, jnp.nan)

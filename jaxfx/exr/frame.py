@@ -1,0 +1,97 @@
+"""Deep frame buffers and their cameras in EXR files."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.exr.layers import MAX_PIXELS, StrPath, assemble, read_planes, write_planes
+from jaxfx.gbuffer import GBuffer
+
+
+Camera = PinholeCamera | OrthographicCamera
+
+_PASSES = ("color", "shader", "ambient", "diffuse", "specular", "normal", "depth", "roughness")
+
+
+def write_gbuffer(path: StrPath, gbuffer: GBuffer, *, camera: Camera | None = None) -> None:
+    """Write a deep frame buffer as eight layers of one EXR file.
+
+    **Arguments:**
+
+    - `path`: the file, written whole or not at all.
+    - `gbuffer`: float16 and float32 are kept, float64 is rounded; shaders are stored as
+      floats, exactly.
+    - `camera`: kept exactly, in the header: which of the two it is, the 3x3 matrix from camera
+      axes to pixels, and the 4x4 pose.
+
+    **Raises:** `ValueError` and `OSError`, as `write`.
+
+    **Gradient:** none; the host side.
+    """
+    attributes: dict[str, Any] = {}
+    if camera is not None:
+        attributes = {
+            "jaxfx.camera": type(camera).__name__,
+            "jaxfx.intrinsics": _matrix(_intrinsics(camera)),
+            "jaxfx.world_from_camera": _matrix(np.asarray(camera.world_from_camera)),
+        }
+    write_planes(path, {name: getattr(gbuffer, name) for name in _PASSES}, attributes)
+
+
+def read_gbuffer(
+    path: StrPath, *, max_pixels: int = MAX_PIXELS
+) -> tuple[GBuffer, Camera | None]:
+    """Read what `write_gbuffer` wrote; other layers in the file are let be.
+
+    **Arguments:** `path`, `max_pixels`: as for `read`.
+
+    **Returns:** the deep frame buffer; and the camera, or None where the file has none.
+
+    **Raises:** `ValueError` and `OSError`, as `read`; a pass that is missing is named.
+
+    **Gradient:** none; the host side.
+    """
+    planes, header = read_planes(path, max_pixels)
+    layers = assemble(path, planes)
+    for name in _PASSES:
+        if name not in layers:
+            raise ValueError(f"`{path}` must have the pass `{name}`, got {sorted(layers)}.")
+    passes = {name: layers[name] for name in _PASSES}
+    with np.errstate(invalid="ignore"):
+        shader = passes["shader"].astype(np.int32)
+    if not np.array_equal(shader, passes["shader"]):
+        raise ValueError(f"`{path}` must have whole numbers in the pass `shader`.")
+    try:
+        return GBuffer(**passes | {"shader": shader}), _camera(header)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"`{path}` must hold a deep frame buffer: {error}") from error
+
+
+def _matrix(values: np.ndarray) -> np.ndarray:
+    """`values` in one of the two types that EXR has for a matrix."""
+    dtype = np.float64 if values.dtype == np.float64 else np.float32
+    return np.ascontiguousarray(values, dtype)
+
+
+def _intrinsics(camera: Camera) -> np.ndarray:
+    if isinstance(camera, PinholeCamera):
+        return np.asarray(camera.intrinsics)
+    scale, centre = np.asarray(camera.pixels_per_unit), np.asarray(camera.centre)
+    matrix = np.eye(3, dtype=np.result_type(scale, centre))
+    matrix[0, 0] = matrix[1, 1] = scale
+    matrix[:2, 2] = centre
+    return matrix
+
+
+def _camera(header: Mapping[str, Any]) -> Camera | None:
+    kind = header.get("jaxfx.camera")
+    if kind is None:
+        return None
+    intrinsics, pose = header["jaxfx.intrinsics"], header["jaxfx.world_from_camera"]
+    if kind == PinholeCamera.__name__:
+        return PinholeCamera(intrinsics, pose)
+    if kind == OrthographicCamera.__name__:
+        return OrthographicCamera(intrinsics[0, 0], intrinsics[:2, 2], pose)
+    raise ValueError(f"`jaxfx.camera` must be one of the two cameras, got {kind!r}.")

@@ -1,0 +1,126 @@
+"""PNG files, and the sRGB curve that screens want."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from jaxfx.exr.layers import StrPath, write_whole
+
+
+def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The sRGB curve: from linear light to what a screen is sent.
+
+    **Arguments:** `linear`: any shape; 0 is black, 1 the screen's white.
+
+    **Returns:** the same type and shape, not clipped: outside [0, 1] the curve goes on.
+
+    **Gradient:** none; the host side.
+
+    Source: IEC 61966-2-1, the piecewise curve.
+    """
+    linear = np.asarray(linear)
+    power = np.maximum(linear, 0.0031308) ** (1 / 2.4)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * power - 0.055)
+
+
+def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The inverse of `srgb_from_linear`.
+
+    **Arguments:** `srgb`: any shape, 0 to 1.
+
+    **Returns:** linear light, the same type and shape, not clipped.
+
+    **Gradient:** none; the host side.
+
+    Source: IEC 61966-2-1, the piecewise curve.
+    """
+    srgb = np.asarray(srgb)
+    power = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
+    return np.where(srgb <= 0.04045, srgb / 12.92, power)
+
+
+def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) -> None:
+    """Write an 8-bit sRGB picture, whole or not at all.
+
+    **Arguments:**
+
+    - `path`: the file; an old one is replaced once the new one is complete.
+    - `image`: height width channel, linear: grey, grey and alpha, RGB or RGBA. Values are
+      clipped to [0, 1] and rounded to the nearest of 256; NaN becomes 0. Alpha is stored
+      linear.
+
+    **Raises:** `ValueError` for anything but an image of 1 to 4 channels; `OSError` where the
+    folder does not exist or can't be written.
+
+    **Gradient:** none; the host side.
+    """
+    from PIL import Image
+
+    array = np.asarray(image)
+    if array.ndim != 3 or not array.size or array.shape[2] > 4 or array.dtype.kind != "f":
+        raise ValueError(
+            "`write_png(image)` must hold floats of shape (height, width, 1 to 4), "
+            f"got {array.dtype} of shape {array.shape}."
+        )
+    values = np.nan_to_num(array.astype(np.float64)).clip(0, 1)
+    pixels = np.rint(255 * _recolor(srgb_from_linear, values)).astype(np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).save(stream, "PNG")
+    write_whole(path, stream.getbuffer())
+
+
+def read_png(path: StrPath) -> Float[np.ndarray, "height width channel"]:
+    """Read an sRGB picture into linear light.
+
+    **Arguments:** `path`: a PNG file. Its numbers are taken for sRGB, alpha for linear; colour
+    profiles in the file are not heeded.
+
+    **Returns:** float32, height width channel, in [0, 1]: grey, grey and alpha, RGB or RGBA,
+    as in the file, 16 bits in full; a palette is looked up.
+
+    **Raises:** `ValueError` that names the file where it is damaged or not PNG; `OSError` where
+    it can't be opened.
+
+    **Gradient:** none; the host side.
+    """
+    data = Path(path).read_bytes()
+    try:
+        values = _png_values(data)
+    except Exception as error:
+        raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
+    return _recolor(linear_from_srgb, values).astype(np.float32)
+
+
+def _recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
+    """`curve` on the colours of an image, not on its alpha."""
+    colors = 3 if values.shape[2] > 2 else 1
+    return np.concatenate([curve(values[:, :, :colors]), values[:, :, colors:]], axis=2)
+
+
+def _png_values(data: bytes) -> np.ndarray:
+    """The numbers of a PNG file, height width channel, over their largest."""
+    from PIL import Image
+
+    def pixels(layout: str = "") -> np.ndarray:
+        picture: Any = Image.open(io.BytesIO(data), formats=("PNG",))
+        if layout:
+            picture.tile = [(*picture.tile[0][:3], layout)]
+        palette = "RGBA" if "transparency" in picture.info else "RGB"
+        mode = {"1": "L", "P": palette}.get(picture.mode, picture.mode)
+        array = np.asarray(picture.convert(mode), np.float64)
+        return array.reshape(*array.shape[:2], -1)
+
+    # Of 16-bit colours Pillow keeps the high bytes. It gives the low ones when asked for the
+    # other byte order, and both of grey and alpha as the four channels of RGBA.
+    layout = Image.open(io.BytesIO(data), formats=("PNG",)).tile[0][3]
+    if layout == "LA;16B":
+        high_low = pixels("RGBA")
+        return (256 * high_low[:, :, ::2] + high_low[:, :, 1::2]) / 65535
+    if layout in ("RGB;16B", "RGBA;16B"):
+        return (256 * pixels() + pixels(layout[:-1] + "L")) / 65535
+    return pixels() / (65535 if layout == "I;16B" else 255)

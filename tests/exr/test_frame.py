@@ -1,0 +1,138 @@
+"""Deep frame buffers in EXR files."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import OpenEXR
+import pytest
+
+from jaxfx import GBuffer, OrthographicCamera, PinholeCamera, exr
+
+
+PASSES = ("color", "shader", "ambient", "diffuse", "specular", "normal", "depth", "roughness")
+
+
+def gbuffer(dtype=np.float32, height=5, width=7):
+    rng = np.random.default_rng(0)
+    images = {name: rng.normal(size=(height, width, 3)).astype(dtype) for name in PASSES}
+    depth = rng.uniform(1, 9, (height, width)).astype(dtype)
+    depth[0] = np.inf
+    flat = {
+        "shader": rng.integers(-1, 3, (height, width), np.int32),
+        "depth": depth,
+        "roughness": rng.random((height, width)).astype(dtype),
+    }
+    return GBuffer(**images | flat)
+
+
+def matrix(seed, size, dtype):
+    return np.random.default_rng(seed).normal(size=(size, size)).astype(dtype)
+
+
+def camera(kind, dtype):
+    pose = matrix(1, 4, dtype)
+    if kind is PinholeCamera:
+        return PinholeCamera(matrix(2, 3, dtype), pose)
+    return OrthographicCamera(np.array(3.3, dtype), np.array([1.1, -2.2], dtype), pose)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_round_trip(tmp_path, dtype):
+    before = gbuffer(dtype)
+    exr.write_gbuffer(tmp_path / "a.exr", before)
+    after, none = exr.read_gbuffer(tmp_path / "a.exr")
+    assert none is None
+    assert eqx.tree_equal(before, after, typematch=True)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", [PinholeCamera, OrthographicCamera])
+def test_the_camera_is_kept_exactly(tmp_path, kind, dtype):
+    before = camera(kind, dtype)
+    exr.write_gbuffer(tmp_path / "a.exr", gbuffer(), camera=before)
+    _, after = exr.read_gbuffer(tmp_path / "a.exr")
+    assert eqx.tree_equal(before, after, typematch=True)
+
+
+def test_double_precision_is_rounded(tmp_path):
+    before = gbuffer(np.float64)
+    exr.write_gbuffer(tmp_path / "a.exr", before)
+    after, _ = exr.read_gbuffer(tmp_path / "a.exr")
+    for name in PASSES:
+        single = getattr(before, name)
+        if name != "shader":
+            single = single.astype(jnp.float32)
+        assert getattr(after, name).dtype == single.dtype
+        np.testing.assert_array_equal(getattr(after, name), single)
+
+
+def test_the_passes_are_layers(tmp_path):
+    before = gbuffer()
+    exr.write_gbuffer(tmp_path / "a.exr", before)
+    layers = exr.read(tmp_path / "a.exr")
+    assert layers.keys() == set(PASSES)
+    for name, layer in layers.items():
+        np.testing.assert_array_equal(layer, getattr(before, name))
+    header = OpenEXR.File(str(tmp_path / "a.exr"), header_only=True).header()
+    names = {channel.name for channel in header["channels"]}
+    assert {"normal.X", "depth.Z", "shader.V", "color.R"} < names
+
+
+def layers_of(buffer):
+    return {name: np.asarray(getattr(buffer, name)) for name in PASSES}
+
+
+def test_other_layers_are_let_be(tmp_path):
+    before = gbuffer()
+    exr.write(tmp_path / "a.exr", layers_of(before) | {"": before.color, "x": before.depth})
+    after, _ = exr.read_gbuffer(tmp_path / "a.exr")
+    assert eqx.tree_equal(before, after, typematch=True)
+
+
+@pytest.mark.parametrize("name", PASSES)
+def test_a_missing_pass_is_named(tmp_path, name):
+    layers = layers_of(gbuffer())
+    del layers[name]
+    exr.write(tmp_path / "a.exr", layers)
+    with pytest.raises(ValueError, match=rf"a.exr` must have the pass `{name}`, got \["):
+        exr.read_gbuffer(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    ("name", "layer", "message"),
+    [
+        ("shader", np.full((5, 7), 0.5), "must have whole numbers in the pass `shader`"),
+        ("shader", np.full((5, 7), np.nan), "must have whole numbers in the pass `shader`"),
+        ("shader", np.zeros((5, 7, 3)), r"`GBuffer\(shader\)` must hold integers of shape"),
+        ("depth", np.ones((5, 7, 1)), r"`GBuffer\(depth\)` must have shape \(5, 7\)"),
+        ("color", np.ones((5, 7)), r"`GBuffer\(color\)` must have shape"),
+    ],
+)
+def test_a_pass_that_does_not_fit_is_named(tmp_path, name, layer, message):
+    exr.write(tmp_path / "a.exr", layers_of(gbuffer()) | {name: layer})
+    with pytest.raises(ValueError, match=rf"a.exr` .*{message}"):
+        exr.read_gbuffer(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"PinholeCamera", b"FisheyeCamera", "must be one of the two cameras, got 'Fisheye"),
+        (b"jaxfx.intrinsics", b"jaxfx.Intrinsics", "'jaxfx.intrinsics'"),
+        (b"jaxfx.camera\0string", b"jaxfx.camera\0strung", "must be one of the two cameras"),
+    ],
+)
+def test_a_damaged_camera(tmp_path, old, new, message):
+    path = tmp_path / "a.exr"
+    exr.write_gbuffer(path, gbuffer(), camera=camera(PinholeCamera, np.float32))
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(ValueError, match=rf"a.exr` must hold a deep frame buffer: .*{message}"):
+        exr.read_gbuffer(path)
+
+
+def test_max_pixels(tmp_path):
+    exr.write_gbuffer(tmp_path / "a.exr", gbuffer())
+    with pytest.raises(ValueError, match="at most `max_pixels=34`, got 7 x 5"):
+        exr.read_gbuffer(tmp_path / "a.exr", max_pixels=34)

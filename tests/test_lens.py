@@ -1,0 +1,281 @@
+"""Lenses against the formulas of their papers, and finite differences."""
+
+import itertools
+
+import hypothesis as hyp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxfx import FocusPlanes, PinholeCamera, ThinLens
+
+
+LENS = ThinLens(0.1, 2.0, 100.0)
+PLANES = FocusPlanes(1.0, 2.0, 5.0, 8.0)
+METHODS = ("defocus", "circle_of_confusion")
+
+
+@jax.jit
+def circle_of_confusion(lens, depth):
+    return lens.circle_of_confusion(depth)
+
+
+positive = st.floats(0.01, 100)
+
+
+def potmesil(focal_length, f_number, focus, depth):
+    """The 1981 paper's circle of confusion, on the sensor, from its image distances."""
+    image_distance = lambda u: focal_length * u / (u - focal_length)
+    sensor, image = image_distance(focus), image_distance(depth)
+    return abs(image - sensor) * (focal_length / f_number) / image
+
+
+@hyp.given(positive, positive, positive, positive, positive)
+@hyp.settings(max_examples=50, deadline=None)
+def test_from_physical_is_the_papers_formula(focal, f_number, beyond, farther, pixels):
+    focus, depth = focal + beyond, focal + farther
+    lens = ThinLens.from_physical(
+        focal_length=focal, f_number=f_number, focus_distance=focus, pixels_per_unit=pixels
+    )
+    expected = potmesil(focal, f_number, focus, depth) * pixels
+    scale = float(lens.aperture * lens.focal_pixels * max(1 / focus, 1 / depth))
+    coc = circle_of_confusion(lens, jnp.array(depth))
+    np.testing.assert_allclose(coc, expected, rtol=1e-9, atol=1e-11 * scale)
+
+
+def test_a_50_mm_lens_at_f_2():
+    """In millimetres: 25 wide, focused at 2 m, seen at 4 m; 100 pixels to the millimetre."""
+    arguments = {"focal_length": 50, "focus_distance": 2000, "pixels_per_unit": 100}
+    lens = ThinLens.from_physical(f_number=2, **arguments)
+    # Image distances 2000 / 39 and 4000 / 79.
+    expected = 25 * (1 - (4000 / 79) / (2000 / 39)) / ((4000 / 79) / (2000 / 39)) * 100
+    np.testing.assert_allclose(lens.defocus(jnp.array(4000.0)), expected, rtol=1e-12)
+    same = ThinLens.from_physical(aperture=25, **arguments)
+    np.testing.assert_allclose(jax.tree.leaves(same), jax.tree.leaves(lens), rtol=1e-12)
+
+
+def test_thin_lens_formula():
+    depth = jnp.array([[0.5, 1.0, 4.0], [20.0, 1e6, 1e-3]])
+    np.testing.assert_allclose(LENS.defocus(depth), 10 * (0.5 - 1 / depth), rtol=1e-12)
+
+
+def test_thin_lens_from_camera():
+    camera = PinholeCamera(np.diag([90.0, 40, 1]), np.eye(4))
+    lens = ThinLens.from_camera(camera, aperture=0.2, focus_distance=3)
+    np.testing.assert_allclose([*jax.tree.leaves(lens)], [0.2, 3, 60], rtol=1e-15)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("lens", [LENS, PLANES])
+def test_special_depths(lens, dtype):
+    depth = jnp.array([1.5, 2, 3, np.inf], dtype)
+    defocus = lens.defocus(depth)
+    assert defocus.dtype == dtype
+    np.testing.assert_array_equal(np.sign(defocus), [-1, 0, 1, 1])
+    np.testing.assert_array_equal(lens.circle_of_confusion(depth), np.abs(defocus))
+    far = 0.1 * 100 / 2 if lens is LENS else 8
+    np.testing.assert_allclose(defocus[3], far, rtol=1e-6)
+    assert lens.focus_distance == 2
+
+
+def test_depth_zero_and_pinholes():
+    zero = jnp.zeros(())
+    assert LENS.defocus(zero) == -np.inf
+    assert LENS.circle_of_confusion(zero) == np.inf
+    for lens in (ThinLens(0, 2, 100), FocusPlanes(1, 2, 5, 0)):
+        depth = jnp.array([0, 1, 2, 3, np.inf])
+        np.testing.assert_array_equal(lens.defocus(depth), 0)
+        np.testing.assert_array_equal(lens.circle_of_confusion(depth), 0)
+
+
+@pytest.mark.parametrize("lens", [LENS, PLANES])
+def test_a_nan_depth_stays_one(lens):
+    for method in METHODS:
+        values = getattr(lens, method)(jnp.array([np.nan, 3.0]))
+        np.testing.assert_array_equal(np.isnan(values), [True, False])
+
+
+def test_focus_planes_are_piecewise_linear():
+    depth = jnp.array([0.0, 0.5, 1, 1.25, 1.5, 2, 2.75, 3.5, 5, 6, np.inf])
+    expected = np.array([-8.0, -8, -8, -6, -4, 0, 2, 4, 8, 8, 8])
+    np.testing.assert_allclose(PLANES.defocus(depth), expected, rtol=1e-14, atol=0)
+    np.testing.assert_allclose(PLANES.circle_of_confusion(depth), abs(expected), rtol=1e-14)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("lens", [LENS, PLANES])
+def test_gradients_at_smooth_points(lens, method):
+    call = jax.jit(lambda lens, depth: getattr(lens, method)(depth))
+    depth = jnp.array([0.4, 1.3, 1.9, 2.2, 4.1, 7.0])
+    check_grads(call, (lens, depth), order=1, rtol=1e-6, eps=1e-4)
+    twice = jax.jit(jax.grad(lambda lens: call(lens, depth).sum()))
+    check_grads(twice, (lens,), order=1, rtol=1e-6, eps=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("lens", [LENS, PLANES])
+def test_background_passes_a_finite_gradient(lens, method):
+    """At infinite depth both modes agree with a depth of 1e15."""
+    call = lambda lens, depth: getattr(lens, method)(depth)
+    far = jax.grad(call, argnums=(0, 1))(lens, jnp.array(1e15))
+    for transform in (jax.grad, jax.jacfwd):
+        found = transform(call, argnums=(0, 1))(lens, jnp.array(jnp.inf))
+        np.testing.assert_allclose(
+            jax.tree.leaves(found), jax.tree.leaves(far), rtol=1e-12, atol=1e-12
+        )
+
+
+def slope_from(function, x, step):
+    """One-sided difference; the sign of `step` is the side."""
+    return (function(x + step) - function(x)) / step
+
+
+@pytest.mark.parametrize("lens", [LENS, PLANES])
+def test_circle_of_confusion_at_its_kink(lens):
+    """On the focus plane: the derivative from behind it."""
+    for transform in (jax.grad, jax.jacfwd):
+        found = transform(lens.circle_of_confusion)(jnp.array(2.0))
+        behind = slope_from(lens.circle_of_confusion, jnp.array(2.0), 1e-7)
+        before = slope_from(lens.circle_of_confusion, jnp.array(2.0), -1e-7)
+        np.testing.assert_allclose(found, behind, rtol=1e-6)
+        assert before < 0 < behind
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("depth", "outside"), [(1.0, -1), (5.0, 1)])
+def test_focus_planes_at_their_outer_kinks(method, depth, outside):
+    """On the near and the far plane: the derivative of the clamped side, zero."""
+    call = getattr(PLANES, method)
+    assert slope_from(call, jnp.array(depth), outside * 1e-6) == 0
+    assert abs(slope_from(call, jnp.array(depth), -outside * 1e-6)) > 1
+    for transform in (jax.grad, jax.jacfwd):
+        assert transform(call)(jnp.array(depth)) == 0
+
+
+@pytest.mark.parametrize("depth", [1.3, 4.1, np.inf])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_closed_aperture_can_be_opened(method, depth):
+    """At aperture 0, and `max_coc` 0, the gradient is the one-sided slope."""
+    thin = lambda aperture: getattr(ThinLens(aperture, 2.0, 100.0), method)(jnp.array(depth))
+    planes = lambda largest: getattr(FocusPlanes(1.0, 2, 5, largest), method)(jnp.array(depth))
+    for call in (thin, planes):
+        expected = slope_from(call, 0.0, 1e-3)
+        assert abs(expected) > 0.1
+        for transform in (jax.grad, jax.jacfwd):
+            np.testing.assert_allclose(transform(call)(0.0), expected, rtol=1e-10)
+
+
+def test_gradients_of_constructors():
+    physical = lambda focal, f_number, focus, scale: ThinLens.from_physical(
+        focal_length=focal, f_number=f_number, focus_distance=focus, pixels_per_unit=scale
+    )
+    check_grads(jax.jit(physical), (0.7, 2.0, 3.0, 20.0), order=1, rtol=1e-6, eps=1e-5)
+    from_camera = lambda fov: ThinLens.from_camera(
+        PinholeCamera.from_fov(fov, height=4, width=4), aperture=0.1, focus_distance=2
+    )
+    check_grads(jax.jit(from_camera), (0.7,), order=1, rtol=1e-6, eps=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("kind", "good", "bad"),
+    [
+        (
+            ThinLens,
+            (0.1, 2.0, 100.0),
+            [(-0.1, 2, 100), (0.1, 0, 100), (0.1, -2, 100), (0.1, 2, 0)],
+        ),
+        (FocusPlanes, (1.0, 2.0, 5.0, 8.0), [(2, 2, 5, 8), (1, 5, 5, 8), (1, 2, 5, -1)]),
+    ],
+)
+def test_a_traced_bad_lens_gives_nan(kind, good, bad, method):
+    depth = jnp.array([0.5, 2, 3, np.inf])
+    call = jax.jit(lambda numbers: getattr(kind(*numbers), method)(depth))
+    assert np.all(np.isfinite(call(jnp.array(good))))
+    for numbers in bad:
+        assert np.all(np.isnan(call(jnp.array(numbers, float))))
+
+
+@pytest.mark.parametrize("kind", [ThinLens, FocusPlanes])
+def test_a_batch_of_lenses(kind):
+    rows = np.cumsum(
+        np.random.default_rng(0).uniform(1, 2, (4, 3 + (kind is FocusPlanes))), axis=1
+    )
+    depth = jnp.linspace(0.5, 9, 7)
+    defocus = lambda numbers: kind(*numbers).defocus(depth)
+    batch = jax.jit(jax.vmap(defocus))(jnp.asarray(rows))
+    for row, found in zip(rows, batch, strict=True):
+        np.testing.assert_allclose(found, defocus(row), rtol=1e-12)
+
+
+def test_fields_are_strongly_typed():
+    for lens in (ThinLens(1, 2, 3), FocusPlanes(1, 2, 3, 4)):
+        for leaf in jax.tree.leaves(lens):
+            assert leaf.dtype == jnp.float64
+            assert not leaf.weak_type
+
+
+def physical(**changes):
+    arguments = {
+        "focal_length": 1.0,
+        "f_number": 2.0,
+        "focus_distance": 3.0,
+        "pixels_per_unit": 10.0,
+    }
+    return ThinLens.from_physical(**(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: ThinLens(-0.1, 2, 3),
+            r"`ThinLens\(aperture\)` must be 0 or positive, got -0.1",
+        ),
+        (lambda: ThinLens(0.1, 0, 3), r"`ThinLens\(focus_distance\)` must be positive, got 0"),
+        (lambda: ThinLens(0.1, 2, -3), r"`ThinLens\(focal_pixels\)` must be positive, got -3"),
+        (
+            lambda: ThinLens([0.1], 2, 3),
+            r"`ThinLens\(aperture\)` must have shape \(\), got \(1,\)",
+        ),
+        (
+            lambda: ThinLens(np.nan, 2, 3),
+            r"`ThinLens\(aperture\)` must be 0 or positive, got nan",
+        ),
+        (
+            lambda: ThinLens(True, 2, 3),
+            r"`ThinLens\(aperture\)` must be a real number, got bool",
+        ),
+        (
+            lambda: ThinLens(1j, 2, 3),
+            r"`ThinLens\(aperture\)` must be a real number, got complex",
+        ),
+        (lambda: physical(aperture=1.0), r"must be given one of the two, got both"),
+        (lambda: physical(f_number=None), r"must be given one of the two, got neither"),
+        (
+            lambda: physical(focus_distance=1.0),
+            r"`from_physical\(focus_distance=...\)` must be beyond `focal_length`",
+        ),
+        (lambda: FocusPlanes(2, 2, 5, 1), r"`FocusPlanes\(near\)` must be before `focus`"),
+        (lambda: FocusPlanes(1, 2, 2, 1), r"`FocusPlanes\(far\)` must be behind `focus`"),
+        (lambda: FocusPlanes(1, 2, 3, -1), r"`FocusPlanes\(max_coc\)` must be 0 or positive"),
+    ],
+)
+def test_errors(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_the_three_numbers_are_all_that_an_image_knows():
+    """Lenses that differ in their physical numbers only give one defocus."""
+    depth = jnp.linspace(1.2, 9, 20)
+    for focal, scale in itertools.product((0.5, 1.0), (10.0, 30.0)):
+        lens = physical(focal_length=focal, pixels_per_unit=scale)
+        image_distance = focal * 3 / (3 - focal)
+        same = ThinLens(focal / 2, 3.0, image_distance * scale)
+        np.testing.assert_allclose(
+            lens.defocus(depth), same.defocus(depth), rtol=1e-12, atol=1e-12
+        )

@@ -1,0 +1,325 @@
+"""Every public function of arrays against itself, under each of JAX's transforms.
+
+Functions are found by themselves, their arguments by name in `EXAMPLES`, and the values of an
+option by its `Literal` annotation. Values are checked elsewhere, against independent oracles.
+"""
+
+import functools
+import importlib
+import inspect
+import itertools
+import pkgutil
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, get_args, get_origin
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxfx
+
+
+# Not functions of arrays: the host side reads files and meshes; solvers, measurements and plans
+# run Python until they are done. Each of these states what it can do in its own tests.
+NOT_TRANSFORMED = {"scene", "exr", "fit", "tradeoff", "budget"}
+
+
+def thin_lens(rng, size):
+    return jaxfx.ThinLens(aperture=0.5, focus_distance=rng.uniform(1.9, 2.1), focal_pixels=20.0)
+
+
+def focus_planes(rng, size):
+    return jaxfx.FocusPlanes(near=0.9, focus=rng.uniform(1.9, 2.1), far=4.5, max_coc=5.0)
+
+
+def pinhole(rng, size):
+    return jaxfx.PinholeCamera.from_fov(rng.uniform(0.9, 1.1), height=size[0], width=size[1])
+
+
+def orthographic(rng, size):
+    centre = np.array(size[::-1]) / 2
+    return jaxfx.OrthographicCamera(rng.uniform(4, 5), centre, np.eye(4))
+
+
+def ambient(rng, size):
+    return jaxfx.AmbientLight(rng.uniform(0.5, 1, 3))
+
+
+def directional(rng, size):
+    return jaxfx.DirectionalLight([0.2, 0.3, 1.0], rng.uniform(0.5, 1, 3))
+
+
+def point(rng, size):
+    return jaxfx.PointLight([0.5, -1.0, 0.2], rng.uniform(0.5, 1, 3))
+
+
+def spot(rng, size):
+    color = rng.uniform(0.5, 1, 3)
+    return jaxfx.SpotLight([0.5, -1.0, 0.2], [-0.1, 0.3, 1.0], color, 0.3, 0.9)
+
+
+def gbuffer(rng, size):
+    normal = np.concatenate([rng.uniform(-0.4, 0.4, (*size, 2)), -np.ones((*size, 1))], axis=-1)
+    return jaxfx.GBuffer(
+        color=rng.uniform(0.1, 1, (*size, 3)),
+        shader=rng.integers(-1, 3, size),
+        ambient=rng.uniform(0.1, 1, (*size, 3)),
+        diffuse=rng.uniform(0.1, 1, (*size, 3)),
+        specular=rng.uniform(0.1, 1, (*size, 3)),
+        normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
+        depth=rng.uniform(1.1, 4, size),
+        roughness=rng.uniform(0.3, 0.9, size),
+    )
+
+
+# Small examples by the parameter's name, several where it may be of several types. `rng` is
+# seeded, `size` is the height and width. Arrays are traced; Python's own numbers are static.
+EXAMPLES = {
+    "image": [lambda rng, size: rng.uniform(0.1, 1, (*size, 3))],
+    "reference": [lambda rng, size: rng.uniform(0.1, 1, (*size, 3))],
+    "depth": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "visibility": [lambda rng, size: rng.uniform(0, 1, size)],
+    "mask": [lambda rng, size: np.ones(size, bool)],
+    "gbuffer": [gbuffer],
+    "camera": [pinhole, orthographic],
+    "lens": [thin_lens, focus_planes],
+    "light": [point, ambient, directional, spot],
+    "lights": [lambda rng, size: [make(rng, size) for make in (ambient, point)]],
+    "gamma": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "epsilon": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "data_range": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "max_coc": [lambda rng, size: 6.0],
+}
+
+
+class Case(NamedTuple):
+    """A function, and for each parameter an option's value or one of the examples."""
+
+    function: Any
+    choice: dict
+
+    def split(
+        self,
+        select=eqx.is_inexact_array,
+        *,
+        seed=0,
+        size=(13, 11),
+        dtype=np.float64,
+        parameters=np.float64,
+    ):
+        """The function of its selected arrays alone, to arrays selected likewise; and those.
+
+        `dtype` is that of images and matrices, `parameters` that of numbers and vectors.
+        """
+
+        def make(name, chosen):
+            if not callable(chosen):
+                return chosen
+            return chosen(np.random.default_rng([seed, *name.encode()]), size)
+
+        def cast(leaf):
+            if not isinstance(leaf, np.ndarray | jax.Array):
+                return leaf
+            wanted = dtype if leaf.ndim >= 2 else parameters
+            return jnp.asarray(leaf, wanted if leaf.dtype == np.float64 else leaf.dtype)
+
+        arguments = {name: make(name, chosen) for name, chosen in self.choice.items()}
+        selected, others = eqx.partition(jax.tree.map(cast, arguments), select)
+
+        def call(selected):
+            return eqx.filter(self.function(**eqx.combine(selected, others)), select)
+
+        return call, selected
+
+
+def _functions():
+    """Every public function whose first argument is data that JAX can trace, by name.
+
+    A function of a Python callable, as the multi-pass reference is, calls it outside of any
+    transform; one of a plain number makes a static table.
+    """
+    found = {}
+    for module in pkgutil.iter_modules(jaxfx.__path__):
+        if module.name[0] == "_" or module.name in NOT_TRANSFORMED:
+            continue
+        face = importlib.import_module(f"jaxfx.{module.name}")
+        for name in getattr(face, "__all__", ()):
+            function = getattr(face, name)
+            if inspect.isclass(function) or not callable(function):
+                continue
+            first = next(iter(inspect.signature(function).parameters.values())).annotation
+            if first not in (int, float, str) and get_origin(first) is not Callable:
+                found[f"{module.name}.{name}"] = function
+    return found
+
+
+def _choices(parameter):
+    """What a parameter may be given: the values of its `Literal`, or the examples of its name.
+
+    An option without an example keeps its default, unless it is one that JAX could trace.
+    """
+    if get_origin(parameter.annotation) is Literal:
+        return sorted(get_args(parameter.annotation), key=lambda v: v != parameter.default)
+    is_array = "jaxtyping" in inspect.formatannotation(parameter.annotation)
+    if parameter.name not in EXAMPLES:
+        is_needed = is_array or parameter.default is parameter.empty
+        return [] if is_needed else [parameter.default]
+    may_be_left_out = is_array and parameter.default is None
+    return EXAMPLES[parameter.name] + [None] * may_be_left_out
+
+
+def _is_accepted(case):
+    """False where the function refuses, by name, options that do not go together."""
+    call, arguments = case.split()
+    try:
+        jax.eval_shape(call, arguments)
+    except ValueError as error:
+        return not str(error).startswith(f"`{case.function.__name__}(")
+    except Exception:
+        return True  # The tests will show it.
+    return True
+
+
+def _cases(name, function):
+    """As few cases as hold every choice once, near the first ones; and what is left over."""
+    parameters = inspect.signature(function).parameters.values()
+    choices = {p.name: _choices(p) for p in parameters}
+    if missing := [f"an example for `{name}`" for name in choices if not choices[name]]:
+        return {}, missing
+    cases, missing = {}, {(p, i) for p, values in choices.items() for i in range(len(values))}
+    rows = itertools.product(*(range(len(values)) for values in choices.values()))
+    for row in sorted(rows, key=np.count_nonzero):
+        new = missing.intersection(zip(choices, row, strict=True))
+        chosen = {p: choices[p][i] for p, i in zip(choices, row, strict=True)}
+        if new and _is_accepted(case := Case(function, chosen)):
+            missing -= new
+            labels = [
+                f"{p}={getattr(chosen[p], '__name__', chosen[p])}" for p, i in sorted(new) if i
+            ]
+            cases["-".join([name, *labels])] = case
+    return cases, [f"an accepted call with `{p}={choices[p][i]!r}`" for p, i in sorted(missing)]
+
+
+FUNCTIONS = _functions()
+CASES, MISSING = {}, {}
+for _name, _function in FUNCTIONS.items():
+    _found, MISSING[_name] = _cases(_name, _function)
+    CASES |= _found
+
+each_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+
+
+def _normal(tree, seed=7):
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), tree)
+
+
+def _dot(one, other):
+    leaves = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return sum(jnp.vdot(x, y) for x, y in leaves)
+
+
+def _assert_close(actual, expected, tolerance=1e-9):
+    leaves = zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True)
+    for x, y in leaves:
+        np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
+
+
+def _assert_finite(tree):
+    for leaf in jax.tree.leaves(tree):
+        assert np.isfinite(leaf).all()
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_argument_and_choice_is_exercised(name):
+    assert not MISSING[name], f"`{name}` needs {', '.join(MISSING[name])}"
+
+
+@each_case
+def test_jit(case):
+    call, arguments = case.split(eqx.is_array)
+    _assert_close(jax.jit(call)(arguments), call(arguments))
+
+
+@each_case
+def test_vmap_is_a_loop(case):
+    call, one = case.split(eqx.is_array)
+    _, two = case.split(eqx.is_array, seed=1)
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), one, two)
+    loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), call(one), call(two))
+    _assert_close(jax.vmap(call)(batch), loop)
+
+
+@each_case
+@pytest.mark.parametrize("parameters", [np.float32, np.float64])
+def test_float32_stays_and_is_close_to_float64(case, parameters):
+    call, arguments = case.split(dtype=np.float32, parameters=parameters)
+    double, same = case.split()
+    out = call(arguments)
+    assert {leaf.dtype for leaf in jax.tree.leaves(out)} == {np.dtype(np.float32)}
+    _assert_close(out, double(same), tolerance=1e-4)
+
+
+@each_case
+def test_derivatives_agree(case):
+    """Forward, linearized and reverse, with one another and with the difference quotient."""
+    call, arguments = case.split()
+    along = _normal(arguments)
+
+    @jax.jit  # One program for all three, which takes half the time to compile.
+    def derivatives(arguments, along):
+        out, pushed = jax.jvp(call, (arguments,), (along,))
+        linear_out, push = jax.linearize(call, arguments)
+        reverse_out, pull = jax.vjp(call, arguments)
+        weight = _normal(out, seed=8)
+        products = _dot(weight, pushed), _dot(pull(weight)[0], along)
+        return (out, pushed), (linear_out, push(along)), reverse_out, products
+
+    (out, pushed), linear, reverse_out, products = derivatives(arguments, along)
+    _assert_close(linear, (out, pushed))
+    _assert_close(reverse_out, out)
+    _assert_close(*products, tolerance=1e-8)
+
+    def moved(step):
+        return jax.jit(call)(jax.tree.map(lambda x, v: x + step * v, arguments, along))
+
+    quotient = jax.tree.map(lambda a, b: (a - b) / 2e-6, moved(1e-6), moved(-1e-6))
+    _assert_close(pushed, quotient, tolerance=1e-5)
+
+
+# Where a test asks only whether numbers are finite, the compiler may take less care.
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@each_case
+def test_nested_gradient_is_finite(case):
+    call, arguments = case.split()
+    along = _normal(arguments)
+
+    def energy(arguments):
+        out = call(arguments)
+        return _dot(out, out)
+
+    def slope(arguments):
+        return _dot(jax.grad(energy)(arguments), along)
+
+    _assert_finite(quick_jit(jax.grad(slope))(arguments))
+
+
+# A score of a picture may need a whole window of it; a picture may have any size.
+PICTURES = {name: case for name, case in CASES.items() if not name.startswith("metrics.")}
+
+
+@pytest.mark.parametrize("case", PICTURES.values(), ids=PICTURES.keys())
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 5)], ids="{0[0]}x{0[1]}".format)
+def test_any_size(case, size):
+    call, arguments = case.split(size=size)
+
+    @quick_jit
+    def value_and_gradient(arguments):
+        out, pull = jax.vjp(call, arguments)
+        return out, pull(_normal(out))
+
+    _assert_finite(value_and_gradient(arguments))
