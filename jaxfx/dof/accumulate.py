@@ -108,5 +108,5 @@ def lens_samples(
 
 
 def _shifted(camera: PinholeCamera, shift: Float[np.ndarray, "2"]) -> PinholeCamera:
-    shift = jnp.asarray(shift, camera.intrinsics.dtype)
-    return PinholeCamera(camera.intrinsics.at[:2, 2].add(shift), camera.world_from_camera)
+    move = jnp.asarray(shift, camera.intrinsics.dtype)
+    return PinholeCamera(camera.intrinsics.at[:2, 2].add(move), camera.world_from_camera)

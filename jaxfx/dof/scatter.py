@@ -20,11 +20,15 @@ from jaxfx._numerics import (
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof._shift import shift
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
+from jaxfx.dof._tiles import tiles
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
-Kernel = Literal["auto", "segment_sum", "shift"]
+Kernel = Literal["auto", "segment_sum", "shift", "tiles"]
 Coverage = Literal["area", "indicator"]
+
+# Where "shift" adds fewer taps than this it takes some 5 ms, and compiles sooner than "tiles".
+_FEW_TAPS = 2**22
 
 # Visibility stays below e**60, so that its sums with highlights are finite in float32.
 _LOG_VISIBILITY = 60.0
@@ -64,8 +68,9 @@ def scatter(
     - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
     - `kernel`: which program computes the sums, all the same: `"segment_sum"` writes every tap
-      out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an offset,
-      `"auto"` takes the cheapest.
+      out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an
+      offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it.
+      `"auto"` is `"tiles"`, or `"shift"` where the work is so little that compiling counts.
     - `coverage`: `"area"`, the exact area of the disc in each row of pixels, or `"indicator"`,
       the paper's own, 1 where a pixel's centre lies inside (`"segment_sum"` only).
 
@@ -188,10 +193,13 @@ def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     depth = jnp.where(lost, lens.focus_distance.astype(image.dtype), depth)
 
     sprites = to_sprites(image, depth, lens, gamma, epsilon, max_coc)
+    far = reach(max_coc)
+    if kernel == "auto":
+        kernel = "shift" if depth.size * (2 * far + 1) ** 2 < _FEW_TAPS else "tiles"
     if kernel == "segment_sum":
-        sums = segment_sum(sprites, reach(max_coc), coverage)
+        sums = segment_sum(sprites, far, coverage)
     else:
-        sums = shift(sprites, reach(max_coc))
+        sums = {"shift": shift, "tiles": tiles}[kernel](sprites, far)
     # Both are scaled to a weight of 1 first: the derivative of a quotient squares it.
     sums = sums / jax.lax.stop_gradient(sums[..., -1:])
     result = sums[..., :-1] / sums[..., -1:]

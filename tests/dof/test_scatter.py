@@ -12,7 +12,7 @@ import pytest
 from jaxfx import FocusPlanes, ThinLens, dof
 
 
-KERNELS = ("segment_sum", "shift")
+KERNELS = ("segment_sum", "shift", "tiles")
 
 
 def row_area(radius, row):
@@ -333,15 +333,15 @@ def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
     def loss(values, image, depth):
         return jnp.sum(picture(values, image, depth, kernel) ** 2)
 
-    value, gradients = jax.value_and_grad(loss, argnums=(0, 1, 2))(values, image, depth)
+    value, gradients = jax.jit(jax.value_and_grad(loss, (0, 1, 2)))(values, image, depth)
     assert np.isfinite(value)
     for leaf in jax.tree.leaves(gradients):
         assert np.isfinite(leaf).all()
     ones = jax.tree.map(jnp.ones_like, (values, image, depth))
-    assert np.isfinite(jax.jvp(loss, (values, image, depth), ones)[1])
+    assert np.isfinite(jax.jit(lambda *x: jax.jvp(loss, x, ones)[1])(values, image, depth))
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("kernel", ["segment_sum", "shift"])
 def test_second_derivatives(kernel):
     image, depth = random_scene(13)
     values = parameters_of(depth.shape)
@@ -359,6 +359,15 @@ def test_second_derivatives(kernel):
     )
     np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-10)
+
+
+def test_tiles_refuse_second_derivatives():
+    image, depth = random_scene(13)
+    loss = lambda a: dof.scatter(
+        image, depth, ThinLens(a, 2.5, 60.0), max_coc=6, kernel="tiles"
+    ).sum()
+    with pytest.raises(NotImplementedError, match='"shift" or "segment_sum"'):
+        jax.jacfwd(jax.grad(loss))(0.1)
 
 
 def test_half_images_keep_their_type():
