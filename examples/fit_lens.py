@@ -1,0 +1,292 @@
+"""From a mesh to a fitted lens.
+
+Renders a mesh with its depth, takes a multi-pass depth-of-field picture of it as the reference,
+and fits the lens and the amplifications of scatter depth of field to that reference by
+gradient, from a start that is wrong on purpose. Writes `reference.exr`, `fitted.exr`,
+`fit.png`, `chart.png` and `report.json`.
+"""
+
+import argparse
+import io
+import json
+import logging
+import math
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+from jaxfx import ThinLens, dof, exr, fit, metrics, relight, scene, tradeoff
+from jaxfx.exr.layers import write_whole
+
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+# The reference's lens: its largest circle of confusion, as a share of the picture's side.
+LARGEST_COC = 0.04
+# Passes that antialias the pinhole picture.
+PINHOLE_PASSES = 16
+# Two lines of the chart.
+MULTI, WHOLE = "multi-pass", "pinhole passes, then scatter"
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
+    parser.add_argument("--size", type=int, default=320, help="side of the picture, pixels")
+    parser.add_argument("--samples", type=int, default=256, help="passes of the reference")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
+    parser.add_argument("--seed", type=int, default=0, help="of the start and of the passes")
+    arguments = parser.parse_args()
+    for name, least in (("size", 16), ("samples", 4), ("seed", 0)):
+        if getattr(arguments, name) < least:
+            parser.error(f"--{name} must be at least {least}, got {getattr(arguments, name)}")
+    return arguments
+
+
+def load(path: Path | None, size: int):
+    """The scene, its camera, lights and depth; a file that won't do ends the program."""
+    try:
+        mesh = scene.still_life() if path is None else scene.load(path)
+        camera = scene.default_camera(mesh, height=size, width=size)
+        depth = scene.gbuffer(mesh, camera, height=size, width=size).depth
+    except (OSError, ValueError, RuntimeError) as error:
+        sys.exit(f"fit_lens.py: error: {error}")
+    return mesh, camera, scene.default_lights(camera), depth
+
+
+def make_folder(folder: Path) -> Path:
+    """The folder, made if need be; said now rather than after minutes of work."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        sys.exit(f"fit_lens.py: error: --out must be a folder to write to: {error}")
+    return folder
+
+
+def lens_for(camera, depth) -> ThinLens:
+    """A lens focused on the nearer third of what is seen, open as wide as LARGEST_COC says."""
+    seen = depth[jnp.isfinite(depth)]
+    if jnp.max(seen) < 1.001 * jnp.min(seen):
+        sys.exit("fit_lens.py: error: all that is seen lies at one depth, nothing is blurred")
+    focus = jnp.quantile(seen, 1 / 3)
+    unit = ThinLens.from_camera(camera, aperture=1.0, focus_distance=focus)
+    largest = jnp.max(unit.circle_of_confusion(seen))
+    aperture = LARGEST_COC * min(depth.shape) / largest
+    return ThinLens(aperture, unit.focus_distance, unit.focal_pixels)
+
+
+def without_holes(depth):
+    """The depth, with the farthest that is seen where there is nothing.
+
+    Nothing is infinitely far, and its circles of confusion larger than any other: scatter,
+    which knows no occlusion, would spread its black over all that is out of focus before it.
+    """
+    return jnp.minimum(depth, jnp.max(jnp.where(jnp.isfinite(depth), depth, 0)))
+
+
+def wrong_start(lens: ThinLens, seed: int) -> dict:
+    """A lens 40 % and 15 % off, gamma and epsilon anywhere: which way, the seed decides."""
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], 4)
+    return {
+        "lens": ThinLens(
+            lens.aperture * (1 + 0.4 * signs[0]),
+            lens.focus_distance * (1 + 0.15 * signs[1]),
+            lens.focal_pixels,
+        ),
+        "gamma": 1.0 * 2.5 ** signs[2],
+        "epsilon": 2.0 * 2.5 ** signs[3],
+    }
+
+
+def numbers(lens: ThinLens, **amplifications) -> dict[str, float]:
+    values = {"aperture": lens.aperture, "focus_distance": lens.focus_distance}
+    return {name: float(value) for name, value in (values | amplifications).items()}
+
+
+def near_edges(depth, radius: int):
+    """The pixels within a radius of a jump in depth by a twentieth; None for no pixel."""
+
+    def largest(x, side):
+        return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (side, side), (1, 1), "SAME")
+
+    inverse = 1 / depth
+    jump = largest(inverse, 3) > 1.05 * -largest(-inverse, 3)
+    mask = largest(jump.astype(depth.dtype), 2 * radius + 1) > 0
+    return mask if mask.any() else None
+
+
+def contenders(multi_pass, pinhole, scatter, image, samples: int) -> dict:
+    """The methods of the chart: `pinhole` and `multi_pass` take a count of passes."""
+    # Of a compiled method every call counts the same.
+    jax.block_until_ready(scatter(image))
+    counts = [2**k for k in range(math.ceil(math.log2(samples)))]
+    # Scatter's picture has its price too, which grows with its antialiasing.
+    return (
+        {"scatter of a given picture": lambda: scatter(image)}
+        | {f"{WHOLE} {n}": lambda n=n: scatter(pinhole(n)) for n in (1, 4, PINHOLE_PASSES)}
+        | {f"{MULTI} {n}": lambda n=n: multi_pass(n) for n in counts}
+    )
+
+
+def draw_chart(measurements, title: str, path: Path) -> None:
+    names = [measurement.name for measurement in measurements]
+    lines = {label: [n for n in names if n.startswith(label)] for label in (MULTI, WHOLE)}
+    figure, ax = plt.subplots(figsize=(8, 5.5), layout="constrained")
+    tradeoff.plot(measurements, ax, lines=lines)
+    ax.set_title(title)
+    save(figure, path)
+
+
+def draw_fit(pictures: dict, losses, path: Path) -> None:
+    figure, axes = plt.subplots(2, 3, figsize=(12, 8.4), layout="constrained")
+    for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
+        ax.imshow(exr.srgb_from_linear(np.clip(np.asarray(picture), 0, 1)))
+        ax.set_title(title)
+        ax.set_axis_off()
+    ax, losses = axes.flat[-1], np.asarray(losses)
+    ax.semilogy(losses, ".-", label="the search")
+    # Within one search a step is taken only where it lowers the loss.
+    for again in 1 + np.flatnonzero(np.diff(losses) > 0):
+        ax.axvline(again, color="0.6", linestyle=":", label="starts again")
+    ax.legend(*(each[:2] for each in ax.get_legend_handles_labels()))
+    ax.set(title="mean squared residual", xlabel="step", box_aspect=1)
+    ax.yaxis.tick_right()
+    ax.grid(alpha=0.3)
+    save(figure, path)
+
+
+def save(figure, path: Path) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=130)
+    plt.close(figure)
+    write_whole(path, buffer.getvalue())
+
+
+def print_table(report: dict) -> None:
+    print(f"{'':16}{'reference':>12}{'start':>12}{'fitted':>12}{'± std. error':>16}")
+    for name in fit.PARAMETERS:
+        known = f"{report['true'][name]:12.4g}" if name in report["true"] else f"{'':12}"
+        fitted, error = report[name], report["uncertainty"][name]
+        print(f"{name:16}{known}{report['start'][name]:12.4g}{fitted:12.4g}{error:16.2g}")
+    print(f"{'PSNR (dB)':28}{report['psnr_start']:12.2f}{report['psnr_fitted']:12.2f}")
+    print(f"{'pinhole (dB)':28}{report['psnr_pinhole']:12.2f}")
+    if not report["converged"]:
+        print("The search ended before it converged; what it had reached is shown.")
+
+
+def strict(value):
+    """The value as JSON has it: null for what is not finite."""
+    if isinstance(value, dict):
+        return {key: strict(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [strict(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def main() -> None:
+    started = time.perf_counter()
+    arguments = parse()
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("jaxfx").setLevel(logging.INFO)
+    out = make_folder(arguments.out)
+    size, samples, seed = arguments.size, arguments.samples, arguments.seed
+    mesh, camera, lights, depth = load(arguments.scene, size)
+    shade = jax.jit(relight.render)
+
+    def render(camera):
+        return shade(scene.gbuffer(mesh, camera, height=size, width=size), camera, lights)
+
+    lens = lens_for(camera, depth)
+
+    def accumulate(aperture, count, seed, progress=False):
+        eye = ThinLens(aperture, lens.focus_distance, lens.focal_pixels)
+        options = {"samples": count, "seed": seed, "progress": progress}
+        return dof.accumulate(render, camera, eye, **options)
+
+    # A lens of no aperture: a pinhole picture, antialiased as the reference is.
+    image = accumulate(0.0, PINHOLE_PASSES, seed).image
+    reference = accumulate(lens.aperture, samples, seed, progress=True)
+    exr.write(out / "reference.exr", {"": reference.image, "depth": depth})
+
+    filled = without_holes(depth)
+    start = wrong_start(lens, seed)
+    fitted = fit.dof(reference.image, image, filled, throw=False, **start)
+    exr.write(out / "fitted.exr", {"": fitted.image, "depth": depth})
+
+    pictures = {
+        "pinhole": image,
+        "start": dof.scatter(image, filled, **start),
+        "fitted": fitted.image,
+    }
+    psnr = {
+        name: float(metrics.psnr(picture, reference.image))
+        for name, picture in pictures.items()
+    }
+    titles = {name: f"{name}, {psnr[name]:.1f} dB" for name in pictures}
+    draw_fit(
+        {
+            titles["pinhole"]: image,
+            f"reference, {samples} passes": reference.image,
+            titles["fitted"]: fitted.image,
+            titles["start"]: pictures["start"],
+            "fitted, 4 times its error": 4 * jnp.abs(fitted.image - reference.image),
+        },
+        fitted.losses,
+        out / "fit.png",
+    )
+
+    def scatter(image):
+        return dof.scatter(
+            image, filled, fitted.lens, gamma=fitted.gamma, epsilon=fitted.epsilon
+        )
+
+    coc = float(jnp.max(fitted.lens.circle_of_confusion(filled)))
+    methods = contenders(
+        # Of another seed than the reference's, which would count its own passes as its truth.
+        lambda count: accumulate(lens.aperture, count, seed + 1).image,
+        lambda count: accumulate(0.0, count, seed + 1).image,
+        scatter,
+        image,
+        samples,
+    )
+    edges = near_edges(depth, math.ceil(coc / 2))
+    measurements = tradeoff.measure(methods, reference.image, mask=edges)
+    title = f"{size} by {size} pixels, largest circle of confusion {coc:.0f} pixels"
+    draw_chart(measurements, title, out / "chart.png")
+
+    report = {f"psnr_{name}": value for name, value in psnr.items()}
+    report |= numbers(fitted.lens, gamma=fitted.gamma, epsilon=fitted.epsilon)
+    report |= {
+        "true": numbers(lens),
+        "start": numbers(**start),
+        "uncertainty": {name: float(value) for name, value in fitted.uncertainty.items()},
+        "converged": fitted.success,
+        "convergence": float(reference.convergence),
+        "largest_coc": coc,
+        "chart": [measurement._asdict() for measurement in measurements],
+        "size": size,
+        "samples": samples,
+        "seed": seed,
+        "cores": os.cpu_count(),
+        "seconds": time.perf_counter() - started,
+    }
+    print_table(report)
+    text = json.dumps(strict(report), indent=2, allow_nan=False)
+    write_whole(out / "report.json", text.encode())
+    print(f"{report['seconds']:.0f} s; pictures and report in {out}")
+
+
+if __name__ == "__main__":
+    main()
