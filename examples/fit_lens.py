@@ -131,7 +131,7 @@ def contenders(multi_pass, pinhole, scatter, image, samples: int) -> dict:
     """The methods of the chart: `pinhole` and `multi_pass` take a count of passes."""
     # Of a compiled method every call counts the same.
     jax.block_until_ready(scatter(image))
-    counts = [2**k for k in range(math.ceil(math.log2(samples)))]
+    counts = [*(2**k for k in range(2, math.ceil(math.log2(samples)))), samples]
     # Scatter's picture has its price too, which grows with its antialiasing.
     return (
         {"scatter of a given picture": lambda: scatter(image)}

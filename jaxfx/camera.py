@@ -9,23 +9,35 @@ from jaxtyping import Array, Float
 from jaxfx._numerics import check, normalize, parameter
 
 
+__all__ = ["OrthographicCamera", "PinholeCamera"]
+
+
 def _each(vector: Float[Array, " n"], like: Float[Array, "... n"]) -> Float[Array, "... n"]:
     """`vector` for every one of `like`'s."""
     return jnp.broadcast_to(vector.astype(like.dtype), like.shape)
+
+
+def _transformed(
+    matrix: Float[Array, "3 3"], points: Float[Array, "... 3"]
+) -> Float[Array, "... 3"]:
+    """`matrix` times each of `points`, written out: a matrix product would not be fused."""
+    columns = matrix.astype(points.dtype).T
+    x, y, z = (points[..., i : i + 1] * _each(columns[i], points) for i in range(3))
+    return x + y + z
 
 
 def _to_world(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
     pose = world_from_camera.astype(points.dtype)
-    return points @ pose[:3, :3].T + _each(pose[:3, 3], points)
+    return _transformed(pose[:3, :3], points) + _each(pose[:3, 3], points)
 
 
 def _to_camera(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
     pose = world_from_camera.astype(points.dtype)
-    return (points - _each(pose[:3, 3], points)) @ pose[:3, :3]
+    return _transformed(pose[:3, :3].T, points - _each(pose[:3, 3], points))
 
 
 def _look_at_pose(eye: Any, target: Any, up: Any) -> Float[Array, "4 4"]:
@@ -76,7 +88,7 @@ class PinholeCamera(eqx.Module):
 
         - `fov_y`: vertical field of view, in radians, between 0 and pi.
         - `height`, `width`: image size in pixels.
-        - `world_from_camera`: the pose; the identity by default.
+        - `world_from_camera`: the 4x4 pose; the identity by default.
 
         **Returns:** the camera.
 
@@ -134,7 +146,7 @@ class PinholeCamera(eqx.Module):
         points = jnp.asarray(points)
         local = _to_camera(self.world_from_camera, points)
         depth = local[..., 2]
-        scaled = local @ self.intrinsics.astype(points.dtype).T
+        scaled = _transformed(self.intrinsics, local)
         return scaled[..., :2] / depth[..., None], depth
 
     def unproject(
@@ -150,8 +162,7 @@ class PinholeCamera(eqx.Module):
         """
         pixels, depth = jnp.asarray(pixels), jnp.asarray(depth)
         homogeneous = jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
-        inverse = jnp.linalg.inv(self.intrinsics).astype(pixels.dtype)
-        rays = homogeneous @ inverse.T
+        rays = _transformed(jnp.linalg.inv(self.intrinsics), homogeneous)
         return _to_world(self.world_from_camera, rays * depth[..., None])
 
     def through_lens(self, offset: Any, *, focus_distance: Any) -> "PinholeCamera":

@@ -1,6 +1,6 @@
 """Parameters of the effects from pictures, by optimistix."""
 
-import functools as ft
+import functools
 import math
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple, final
@@ -9,8 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
 from jaxfx._numerics import check, check_depth, check_image, parameter
@@ -18,23 +18,38 @@ from jaxfx.dof.scatter import largest_coc, scatter
 from jaxfx.lens import ThinLens
 
 
+__all__ = ["PARAMETERS", "DofFit", "dof"]
+
 PARAMETERS = ("aperture", "focus_distance", "gamma", "epsilon")
+
 # Start values of zero have no logarithm.
 _SMALLEST = 1e-6
 _EPSILON_RESTARTS = (2.0, 0.5)
+# How much larger than its start's largest circle of confusion a search may draw, and how often
+# one goes on with more room from where it ran out.
+_ROOM, _ROUNDS = 1.5, 4
+# Our own solver has also converged when so many steps make the loss smaller by less than this
+# share: in float32, rounding hides from it that it has arrived.
+_PATIENCE, _GAIN = 6, 1e-5
+
+_Unknowns = dict[str, Float[Array, ""]]
 
 
 @final
 class DofFit(eqx.Module):
     """What `dof` found.
 
-    - `lens`, `gamma`, `epsilon`: the fitted parameters; frozen ones as they were given.
+    - `lens`, `gamma`, `epsilon`: the parameters, lengths in scene units, a number, and pixels;
+      frozen ones as they were given.
     - `image`: height width channel, `scatter` with them.
-    - `losses`: the mean squared residual at the start and after every step; it rises where
-      the search starts again.
+    - `losses`: the mean squared residual at the start and after every step, in squared units
+      of radiance; it may rise where the search starts again.
     - `uncertainty`: a standard error for each fitted parameter, in its own unit, as if the
-      residuals were independent: they are not, so compare the numbers with one another. A
-      parameter that the picture can't tell has a large one, or inf.
+      residuals were independent: they seldom are, so compare the numbers with one another. A
+      parameter that the picture can't tell has a large one, or inf. It knows nothing of other
+      minima.
+    - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
+      larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
     - `result`: optimistix' verdict.
     """
 
@@ -44,6 +59,7 @@ class DofFit(eqx.Module):
     image: Float[Array, "height width channel"]
     losses: Float[Array, " steps"]
     uncertainty: dict[str, Float[Array, ""]]
+    clamped: Float[Array, ""]
     result: optx.RESULTS
 
     @property
@@ -80,10 +96,10 @@ def dof(
     - `image`, `depth`: height width channel and height width, as in `dof.scatter`.
     - `lens`: where the search starts, lengths in scene units; `focal_pixels` is never fitted.
     - `gamma`, `epsilon`: where the search starts, no unit and pixels.
-    - `max_coc`: static; the largest diameter, in pixels, that the search may use. By default
-      twice the start's largest.
-    - `solver`: any least-squares solver or minimiser of optimistix; Levenberg-Marquardt by
-      default.
+    - `max_coc`: static; the largest diameter, in pixels, that the search may draw. By default
+      half as large again as the start's largest, and larger wherever that proves too small.
+    - `solver`: any least-squares solver or minimiser of optimistix. By default
+      Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.PARAMETERS`; the others stay as given.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the solver fails; else the failure stands in the result.
@@ -92,11 +108,44 @@ def dof(
     **Returns:** a `DofFit`.
 
     **Raises:** `ValueError` for what `dof.scatter` refuses, for shapes that differ, an unknown
-    or empty choice of parameters, a zero aperture to start from, or a reference that is not
+    or empty choice of parameters, a zero aperture to start from, or a picture that is not
     finite. `RuntimeError` where the solver fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
     """
+    reference, image, depth = _pictures(reference, image, depth)
+    start = _start(lens, gamma, epsilon, image.dtype)
+    unknowns = {name: _unconstrain(name, start[name]) for name in _names(parameters)}
+    if not isinstance(max_steps, int) or max_steps < 1:
+        raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
+    model = _Model(image, depth, lens.focal_pixels, start, max_coc)
+    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+        solve = lambda model, y: _solve(model, reference, y, solver, max_steps, bar)
+        model, end = _search(model, unknowns, solve)
+    if throw and end.result != optx.RESULTS.successful:
+        raise RuntimeError(
+            f"`dof` found no fit in {len(end.losses)} steps, the mean squared residual going "
+            f"from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {optx.RESULTS[end.result]} "
+            "`throw=False` returns what was reached."
+        )
+
+    found = _constrain(end.unknowns, image.dtype)
+    values = start | found
+    fitted = _drawn(model, found)
+    return DofFit(
+        model.lens(found),
+        values["gamma"],
+        values["epsilon"],
+        fitted,
+        jnp.stack(end.losses),
+        _standard_errors(model, found, fitted - reference),
+        model.clamped(found),
+        end.result,
+    )
+
+
+def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Array]:
+    """The pictures, checked, in the type of `image`."""
     image = check_image("dof(image)", image)
     reference = check_image("dof(reference)", reference)
     depth = check_depth("dof(depth)", depth, image.shape[:2])
@@ -108,15 +157,14 @@ def dof(
     for name, value in (("image", image), ("reference", reference)):
         if not bool(jnp.isfinite(value).all()):
             raise ValueError(f"`dof({name})` must be finite, got a NaN or inf pixel.")
+    return reference.astype(image.dtype), image, depth
+
+
+def _start(lens: Any, gamma: Any, epsilon: Any, dtype: DTypeLike) -> _Unknowns:
+    """All four parameters where the search starts, checked, in one type."""
     if not isinstance(lens, ThinLens):
         raise ValueError(f"`dof(lens)` must be a ThinLens, got {type(lens).__name__}.")
     check("dof(lens.aperture)", lens.aperture, lambda v: v > 0, "positive to start a search")
-    free = tuple(name for name in PARAMETERS if name in parameters)
-    if not free or len(free) != len(parameters):
-        raise ValueError(
-            f"`dof(parameters=...)` must name some of {PARAMETERS}, got {tuple(parameters)}."
-        )
-
     start = {
         "aperture": lens.aperture,
         "focus_distance": lens.focus_distance,
@@ -125,122 +173,211 @@ def dof(
     }
     for name in ("gamma", "epsilon"):
         check(f"dof({name}=...)", start[name], lambda v: v >= 0, "0 or positive")
-    start = {name: value.astype(image.dtype) for name, value in start.items()}
-    max_coc = 2 * largest_coc("dof", depth, lens) if max_coc is None else max_coc
+    return {name: value.astype(dtype) for name, value in start.items()}
 
-    def model(values: dict[str, Array]) -> Float[Array, "height width channel"]:
-        values = start | values
-        lens_ = ThinLens(values["aperture"], values["focus_distance"], lens.focal_pixels)
-        options = {"gamma": values["gamma"], "epsilon": values["epsilon"]}
-        return scatter(image, depth, lens_, max_coc=max_coc, **options)
 
-    target = reference.astype(image.dtype)
-    unknowns = {name: _unconstrain(name, start[name]) for name in free}
-    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5) if solver is None else solver
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
-        solve = _stepper(
-            lambda y: model(_constrain_all(y)) - target, unknowns, solver, max_steps, bar
+def _names(parameters: Collection[str]) -> list[str]:
+    names = [name for name in PARAMETERS if name in parameters]
+    if not names or len(names) != len(parameters):
+        raise ValueError(
+            f"`dof(parameters=...)` must name some of {PARAMETERS}, got {tuple(parameters)}."
         )
-        end = solve(unknowns)
-        losses = end.losses
-        for factor in _EPSILON_RESTARTS if "epsilon" in free else ():
-            epsilon = end.unknowns["epsilon"] + math.log(factor)
-            again = solve(end.unknowns | {"epsilon": epsilon})
-            losses = losses + again.losses
-            if again.result == optx.RESULTS.successful and again.loss < end.loss:
-                end = again
-    if throw and end.result != optx.RESULTS.successful:
-        raise RuntimeError(
-            f"`dof` found no fit in {len(losses)} steps, the mean squared residual falling "
-            f"from {losses[0]:.3g} to {end.loss:.3g}: {optx.RESULTS[end.result]} "
-            "`throw=False` returns what was reached."
-        )
-
-    values = _constrain_all(end.unknowns)
-    fitted = jax.jit(model)(values)
-    uncertainty = _standard_errors(model, values, fitted - target)
-    values = start | values
-    return DofFit(
-        ThinLens(values["aperture"], values["focus_distance"], lens.focal_pixels),
-        values["gamma"],
-        values["epsilon"],
-        fitted,
-        jnp.stack(losses),
-        uncertainty,
-        end.result,
-    )
+    return names
 
 
 def _unconstrain(name: str, value: Array) -> Array:
-    value = jnp.maximum(value, _SMALLEST)
+    # In JAX's default type: that is the type of the solvers' own numbers.
+    value = jnp.maximum(value.astype(float), _SMALLEST)
     return value + jnp.log(-jnp.expm1(-value)) if name == "gamma" else jnp.log(value)
 
 
-def _constrain_all(unknowns: dict[str, Array]) -> dict[str, Array]:
+def _constrain(unknowns: _Unknowns, dtype: DTypeLike) -> _Unknowns:
     return {
-        name: jax.nn.softplus(value) if name == "gamma" else jnp.exp(value)
+        name: (jax.nn.softplus if name == "gamma" else jnp.exp)(value).astype(dtype)
         for name, value in unknowns.items()
     }
 
 
-class _End(NamedTuple):
-    """Where a solver stopped, its loss there, all losses on the way, and its verdict."""
+class _Model(eqx.Module):
+    """`scatter` as a function of some of its parameters, the others as at the start."""
 
-    unknowns: PyTree
-    loss: float
-    losses: list[Array]
+    image: Float[Array, "height width channel"]
+    depth: Float[Array, "height width"]
+    focal_pixels: Float[Array, ""]
+    start: _Unknowns
+    max_coc: int | float | None = eqx.field(static=True)
+
+    def lens(self, values: _Unknowns) -> ThinLens:
+        values = self.start | values
+        return ThinLens(values["aperture"], values["focus_distance"], self.focal_pixels)
+
+    def __call__(self, values: _Unknowns) -> Float[Array, "height width channel"]:
+        lens, values = self.lens(values), self.start | values
+        gamma, epsilon = values["gamma"], values["epsilon"]
+        return scatter(
+            self.image, self.depth, lens, gamma=gamma, epsilon=epsilon, max_coc=self.max_coc
+        )
+
+    def with_room(self, values: _Unknowns) -> "_Model":
+        """The model that draws the circles of these values and still larger ones."""
+        room = _ROOM * largest_coc("dof", self.depth, self.lens(values))
+        return _Model(self.image, self.depth, self.focal_pixels, self.start, room)
+
+    def clamped(self, values: _Unknowns) -> Float[Array, ""]:
+        """The share of pixels whose circles it can't draw in full."""
+        assert self.max_coc is not None
+        return jnp.mean(self.lens(values).circle_of_confusion(self.depth) > self.max_coc)
+
+
+class _End(NamedTuple):
+    """Where a solver stopped, the losses at its start and after every step, its verdict."""
+
+    unknowns: _Unknowns
+    losses: list[Float[Array, ""]]
     result: optx.RESULTS
 
 
-def _stepper(
-    residual: Callable[[PyTree], Array], example: PyTree, solver: Any, max_steps: int, bar: tqdm
-) -> Callable[[PyTree], _End]:
-    """A function that takes a start to its end, one step at a time, to keep every loss."""
+def _search(
+    model: _Model, unknowns: _Unknowns, solve: Callable[[_Model, _Unknowns], _End]
+) -> tuple[_Model, _End]:
+    """The best end from `unknowns`, under the first model that has room for it."""
+    fixed = model.max_coc is not None
+    values = lambda unknowns: _constrain(unknowns, model.image.dtype)
+    model = model if fixed else model.with_room(values(unknowns))
+    end = solve(model, unknowns)
+    losses = end.losses
+    for _ in range(0 if fixed else _ROUNDS):
+        if model.clamped(values(end.unknowns)) == 0:
+            break
+        model = model.with_room(values(end.unknowns))
+        end = solve(model, end.unknowns)
+        losses = losses + end.losses
+    for factor in _EPSILON_RESTARTS if "epsilon" in unknowns else ():
+        epsilon = end.unknowns["epsilon"] + math.log(factor)
+        again = solve(model, end.unknowns | {"epsilon": epsilon})
+        losses = losses + again.losses
+        if again.result == optx.RESULTS.successful and again.losses[-1] < end.losses[-1]:
+            end = again
+    return model, end._replace(losses=losses)
 
-    def with_loss(y, _):
-        out = residual(y)
-        loss = jnp.mean(out * out)
-        return (loss if isinstance(solver, optx.AbstractMinimiser) else out), loss
 
-    fn = eqx.filter_closure_convert(with_loss, example, None)
-    init = ft.partial(solver.init, fn, args=None, options={}, tags=frozenset())
-    rest = {"args": None, "options": {}, "tags": frozenset()}
-    step = eqx.filter_jit(lambda y, state: solver.step(fn, y, state=state, **rest))
-    stop = eqx.filter_jit(lambda y, state: solver.terminate(fn, y, state=state, **rest))
-    loss_at = eqx.filter_jit(lambda y: fn(y, None)[1])
+def _solve(
+    model: _Model,
+    reference: Float[Array, "height width channel"],
+    y: _Unknowns,
+    solver: Any,
+    max_steps: int,
+    bar: tqdm,
+) -> _End:
+    """From a start to its end, one step at a time, to keep every loss."""
+    patience = _PATIENCE if solver is None else max_steps
+    solver = _default_solver() if solver is None else solver
+    fn = _Objective(model, reference, isinstance(solver, optx.AbstractMinimiser))
+    state = _begin(solver, fn, y)
+    losses, lowest, best, waited = [], math.inf, y, 0
+    verdict = optx.RESULTS.nonlinear_max_steps_reached
+    for _ in range(max_steps):
+        given = y
+        y, state, loss, done, result = _step(solver, fn, y, state)
+        losses.append(loss)
+        bar.update()
+        bar.set_postfix(mse=f"{float(loss):.3g}")
+        waited = waited + 1 if loss > (1 - _GAIN) * lowest else 0
+        if loss < lowest:
+            lowest, best = float(loss), given
+        if done or waited >= patience or result != optx.RESULTS.successful:
+            verdict = result
+            break
+    y = _finish(solver, fn, y, state, losses[-1], verdict)
+    loss = _loss(fn, y)
+    if not math.isfinite(loss):
+        y, loss, verdict = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
+    return _End(y, [*losses, loss], verdict)
 
-    def solve(y: PyTree) -> _End:
-        out_struct, loss_struct = fn.out_struct
-        state = init(y, f_struct=out_struct, aux_struct=loss_struct)
-        losses, verdict = [loss_at(y)], optx.RESULTS.nonlinear_max_steps_reached
-        for _ in range(max_steps):
-            y, state, _ = step(y, state)
-            losses.append(loss_at(y))
-            bar.update()
-            bar.set_postfix(mse=f"{float(losses[-1]):.3g}")
-            done, result = stop(y, state)
-            if not bool(jnp.isfinite(losses[-1])):
-                result = optx.RESULTS.nonlinear_divergence
-            if done or result != optx.RESULTS.successful:
-                verdict = result
-                break
-        return _End(y, float(losses[-1]), losses, verdict)
 
-    return solve
+class _Objective(eqx.Module):
+    """What a solver is given: the residual or, for a minimiser, its mean square; and that."""
+
+    model: _Model
+    reference: Float[Array, "height width channel"]
+    scalar: bool = eqx.field(static=True)
+
+    def __call__(self, unknowns: _Unknowns, _: None) -> tuple[Array, Array]:
+        values = _constrain(unknowns, self.reference.dtype)
+        residual = (self.model(values) - self.reference).astype(float)
+        loss = jnp.mean(residual * residual)
+        return (loss if self.scalar else residual), loss
+
+
+@functools.cache
+def _default_solver() -> optx.LevenbergMarquardt:
+    return optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+
+
+# A solver's state holds functions, which `jit` compares by identity. Only its arrays leave a
+# compiled function, and go back into a state made anew: so all searches share one program.
+_REST = {"args": None, "options": {}, "tags": frozenset()}
+
+
+def _new_state(solver: Any, fn: _Objective, y: _Unknowns) -> Any:
+    out, loss = eqx.filter_eval_shape(fn, y, None)
+    return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
+
+
+def _arrays(state: Any) -> list[Array]:
+    return jax.tree.leaves(eqx.filter(state, eqx.is_array))
+
+
+def _state(solver: Any, fn: _Objective, y: _Unknowns, arrays: list[Array]) -> Any:
+    old, static = eqx.partition(_new_state(solver, fn, y), eqx.is_array)
+    return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), arrays), static)
+
+
+@eqx.filter_jit
+def _begin(solver, fn, y):
+    return _arrays(_new_state(solver, fn, y))
+
+
+@eqx.filter_jit
+def _step(solver, fn, y, arrays):
+    # The loss is that of the `y` that was given.
+    y, state, loss = solver.step(fn, y, state=_state(solver, fn, y, arrays), **_REST)
+    return y, _arrays(state), loss, *solver.terminate(fn, y, state=state, **_REST)
+
+
+@eqx.filter_jit
+def _finish(solver, fn, y, arrays, loss, result):
+    state = _state(solver, fn, y, arrays)
+    return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[0]
+
+
+@eqx.filter_jit
+def _loss(fn, y):
+    return fn(y, None)[1]
+
+
+@eqx.filter_jit
+def _drawn(model, values):
+    return model(values)
+
+
+@eqx.filter_jit
+def _jacobian(model, values):
+    return jax.jacfwd(model)(values)
 
 
 def _standard_errors(
-    model: Callable[[dict[str, Array]], Array], values: dict[str, Array], residual: Array
+    model: _Model, values: _Unknowns, residual: Array
 ) -> dict[str, Float[Array, ""]]:
     """Square roots of the diagonal of `sigma**2 (J^T J)^-1`, J by forward mode."""
-    jacobian = jax.jit(jax.jacfwd(model))(values)
+    jacobian = _jacobian(model, values)
     columns = jnp.stack([jacobian[name].reshape(-1) for name in values], axis=1)
     norms = jnp.linalg.norm(columns, axis=0)
     known = norms > 0
-    scaled = columns / jnp.where(known, norms, 1)
+    scaled = columns / jnp.where(known, norms, 1)[None]
     eigenvalues, vectors = jnp.linalg.eigh(scaled.T @ scaled)
     floor = jnp.finfo(columns.dtype).eps
-    variance = jnp.sum(vectors**2 / jnp.maximum(eigenvalues, floor), axis=1)
+    variance = jnp.sum(vectors**2 / jnp.maximum(eigenvalues, floor)[None], axis=1)
     sigma = jnp.sqrt(jnp.sum(residual**2) / max(residual.size - len(values), 1))
     errors = jnp.where(known, sigma * jnp.sqrt(variance) / norms, jnp.inf)
     return dict(zip(values, errors, strict=True))

@@ -9,6 +9,9 @@ from jaxtyping import Array, Float, Int
 from jaxfx._numerics import parameter
 
 
+__all__ = ["GBuffer"]
+
+
 @final
 class GBuffer(eqx.Module):
     """The eight parameters of every pixel that no light changes.

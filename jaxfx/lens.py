@@ -10,6 +10,9 @@ from jaxfx._numerics import absolute, check, clip01, parameter
 from jaxfx.camera import PinholeCamera
 
 
+__all__ = ["FocusPlanes", "ThinLens"]
+
+
 def _all_positive(*values: Array) -> Array:
     return jnp.stack([value > 0 for value in values]).all()
 
@@ -82,9 +85,10 @@ class ThinLens(eqx.Module):
 
         **Arguments:**
 
-        - `focal_length`: F.
-        - `aperture` or `f_number`: just one; aperture is `focal_length / f_number`.
-        - `focus_distance`: depth in focus, farther than `focal_length`.
+        - `focal_length`: F, a length.
+        - `aperture`: the lens' diameter, a length; or else `f_number`.
+        - `f_number`: the ratio `focal_length / aperture`; or else `aperture`.
+        - `focus_distance`: depth in focus, a length greater than `focal_length`.
         - `pixels_per_unit`: pixels per unit of length on the sensor.
 
         **Returns:** the lens: `focal_pixels` is the image distance of the focus plane,

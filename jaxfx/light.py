@@ -9,6 +9,9 @@ from jaxtyping import Array, Float
 from jaxfx._numerics import check, parameter
 
 
+__all__ = ["AmbientLight", "DirectionalLight", "Light", "PointLight", "SpotLight"]
+
+
 def _direction(name: str, value: Any) -> Float[Array, "3"]:
     direction = parameter(name, value, (3,))
     check(name, direction, lambda v: v.any(), "a vector other than zero")

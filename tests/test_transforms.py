@@ -208,6 +208,9 @@ for _name, _function in FUNCTIONS.items():
     _found, MISSING[_name] = _cases(_name, _function)
     CASES |= _found
 
+# Compiling is most of the work. `test_jit` does it as a user does; the others may save on it.
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
 each_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 
 
@@ -268,7 +271,7 @@ def test_derivatives_agree(case):
     call, arguments = case.split()
     along = _normal(arguments)
 
-    @jax.jit  # One program for all three, which takes half the time to compile.
+    @quick_jit  # One program for all three, which takes half the time to compile.
     def derivatives(arguments, along):
         out, pushed = jax.jvp(call, (arguments,), (along,))
         linear_out, push = jax.linearize(call, arguments)
@@ -282,15 +285,13 @@ def test_derivatives_agree(case):
     _assert_close(reverse_out, out)
     _assert_close(*products, tolerance=1e-8)
 
+    value = quick_jit(call)
+
     def moved(step):
-        return jax.jit(call)(jax.tree.map(lambda x, v: x + step * v, arguments, along))
+        return value(jax.tree.map(lambda x, v: x + step * v, arguments, along))
 
     quotient = jax.tree.map(lambda a, b: (a - b) / 2e-6, moved(1e-6), moved(-1e-6))
     _assert_close(pushed, quotient, tolerance=1e-5)
-
-
-# Where a test asks only whether numbers are finite, the compiler may take less care.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @each_case
@@ -313,7 +314,7 @@ PICTURES = {name: case for name, case in CASES.items() if not name.startswith("m
 
 
 @pytest.mark.parametrize("case", PICTURES.values(), ids=PICTURES.keys())
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 5)], ids="{0[0]}x{0[1]}".format)
+@pytest.mark.parametrize("size", [(1, 1), (1, 7)], ids="{0[0]}x{0[1]}".format)
 def test_any_size(case, size):
     call, arguments = case.split(size=size)
 

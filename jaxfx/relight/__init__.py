@@ -1,0 +1,6 @@
+"""Relighting: a deep frame buffer shaded again whenever a light changes."""
+
+from jaxfx.relight.shading import render, shade
+
+
+__all__ = ["render", "shade"]

@@ -1,0 +1,485 @@
+"""Shading against a plain loop over pixels, hand-made pixels and finite differences."""
+
+import inspect
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx import (
+    AmbientLight,
+    DirectionalLight,
+    GBuffer,
+    OrthographicCamera,
+    PinholeCamera,
+    PointLight,
+    SpotLight,
+    relight,
+)
+
+
+SHADERS = {"lambert": 0, "phong": 1, "blinn": 2}
+LIGHTS = {
+    "ambient": AmbientLight([0.3, 0.2, 0.1]),
+    "directional": DirectionalLight([0.3, 0.5, 2.0], [1.0, 2.0, 3.0]),
+    "point": PointLight([-0.6, -0.9, 0.2], [3.0, 2.0, 1.0]),
+    "spot": SpotLight([0.4, -0.5, 0.1], [-0.4, 0.3, 2.0], [3.0, 4.0, 5.0], 0.05, 0.7),
+}
+REFLECTANCES = ("color", "ambient", "diffuse", "specular")
+
+
+def make_camera(kind, height, width):
+    pinhole = PinholeCamera.look_at(
+        [0.3, -0.4, 0.2], [0.1, 0.2, 3], up=[0.2, -1, 0], fov_y=0.7, height=height, width=width
+    )
+    if kind == "pinhole":
+        return pinhole
+    return OrthographicCamera(height / 2, [width / 2, height / 2], pinhole.world_from_camera)
+
+
+def make_gbuffer(seed, height=7, width=9, background=True):
+    """Surfaces that more or less face the camera, of all models, with some background."""
+    rng = np.random.default_rng(seed)
+    shape = (height, width)
+    normal = rng.normal((0, 0, -1), 0.4, (*shape, 3))
+    shader = rng.permutation(height * width).reshape(shape) % (4 if background else 3)
+    shader = np.where(shader == 3, -1, shader)
+    return GBuffer(
+        **{name: rng.uniform(0.1, 1, (*shape, 3)) for name in REFLECTANCES},
+        shader=shader,
+        normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
+        depth=np.where(shader == -1, np.inf, rng.uniform(1.5, 4, shape)),
+        roughness=rng.uniform(0.3, 0.9, shape),
+    )
+
+
+def one_pixel(shader=0, *, normal=(0, 0, -1), depth=1.0, roughness=0.5):
+    """A grey pixel on the axis of `FRONT`, at (0, 0, depth)."""
+    fields = zip(REFLECTANCES, (1, 0.1, 0.5, 0.25), strict=True)
+    return GBuffer(
+        **{name: np.full((1, 1, 3), float(value)) for name, value in fields},
+        shader=np.full((1, 1), shader),
+        normal=np.full((1, 1, 3), normal, float),
+        depth=np.full((1, 1), float(depth)),
+        roughness=np.full((1, 1), float(roughness)),
+    )
+
+
+# A camera at the origin whose only pixel looks along z.
+FRONT = PinholeCamera([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], np.eye(4))
+
+
+def cast(tree, dtype):
+    floats, others = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lambda leaf: leaf.astype(dtype), floats), others)
+
+
+def loop(gbuffer, camera, light):
+    """The page's equations, pixel by pixel, in float64."""
+    unit = lambda v: v / np.linalg.norm(v)
+    number = lambda v: np.asarray(v, np.float64)
+    shader, depth = np.asarray(gbuffer.shader), number(gbuffer.depth)
+    image = np.zeros((*depth.shape, 3))
+    pose = number(camera.world_from_camera)
+    for j, i in np.ndindex(depth.shape):
+        if shader[j, i] == -1:
+            continue
+        ambient, diffuse, specular, normal, roughness = (
+            number(getattr(gbuffer, name))[j, i]
+            for name in ("ambient", "diffuse", "specular", "normal", "roughness")
+        )
+        color = number(light.color)
+        if isinstance(light, AmbientLight):
+            image[j, i] = color * ambient
+            continue
+
+        if isinstance(camera, PinholeCamera):
+            ray = np.linalg.inv(number(camera.intrinsics)) @ [i + 0.5, j + 0.5, 1]
+            position = pose[:3, :3] @ (ray * depth[j, i]) + pose[:3, 3]
+            to_camera = unit(pose[:3, 3] - position)
+        else:
+            plane = [i + 0.5, j + 0.5] - number(camera.centre)
+            local = [*(plane / number(camera.pixels_per_unit)), depth[j, i]]
+            position = pose[:3, :3] @ local + pose[:3, 3]
+            to_camera = unit(-pose[:3, 2])
+
+        if isinstance(light, DirectionalLight):
+            to_light = unit(-number(light.direction))
+        else:
+            offset = number(light.position) - position
+            to_light = unit(offset)
+            color = color / (offset @ offset)
+        if isinstance(light, SpotLight):
+            inner, outer = np.cos(number(light.inner_angle)), np.cos(number(light.outer_angle))
+            s = np.clip(
+                (-to_light @ unit(number(light.direction)) - outer) / (inner - outer), 0, 1
+            )
+            color = color * (3 * s**2 - 2 * s**3)
+
+        normal = unit(normal)
+        cosine = normal @ to_light
+        if cosine <= 0:
+            continue
+        mirrored = 2 * cosine * normal - to_light
+        halfway = unit(to_light + to_camera)
+        bases = {0: 0.0, 1: max(mirrored @ to_camera, 0), 2: max(normal @ halfway, 0)}
+        highlight = bases[int(shader[j, i])] ** (2 / roughness**2 - 2)
+        image[j, i] = color * (diffuse * cosine + specular * highlight)
+    return image
+
+
+each_light = pytest.mark.parametrize("light", LIGHTS.values(), ids=LIGHTS.keys())
+each_camera = pytest.mark.parametrize("camera", ["pinhole", "orthographic"])
+
+
+@each_light
+@each_camera
+@pytest.mark.parametrize("shader", SHADERS.values(), ids=SHADERS.keys())
+def test_equals_the_loop(camera, light, shader):
+    gbuffer = make_gbuffer(shader)
+    gbuffer = eqx.tree_at(
+        lambda g: g.shader, gbuffer, jnp.where(gbuffer.shader < 0, -1, shader)
+    )
+    camera = make_camera(camera, 7, 9)
+    expected = loop(gbuffer, camera, light)
+    assert (expected > 0).any(axis=-1).sum() > 10
+    result = relight.shade(gbuffer, camera, light)
+    np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-13)
+
+
+def sun(*direction):
+    return DirectionalLight(direction, [4, 8, 12])
+
+
+SLANTED = (np.sqrt(0.75), 0, 0.5)  # Sixty degrees off the axis.
+LAMP = PointLight([0, 0, 0], [4, 8, 12])
+AHEAD = SpotLight([0, 0, 0], [0, 0, 1], [4, 8, 12], 0, 1)
+CLOSED = eqx.tree_at(lambda spot: spot.outer_angle, AHEAD, AHEAD.inner_angle)
+
+
+@pytest.mark.parametrize(
+    ("gbuffer", "light", "expected"),
+    [
+        (one_pixel(), AmbientLight([4, 8, 12]), 0.1),
+        (one_pixel(), sun(0, 0, 5), 0.5),
+        (one_pixel(), sun(*SLANTED), 0.25),
+        (one_pixel(), sun(0, 0, -1), 0),
+        # Twice as far, a quarter. The lamp is at the eye, so the highlight is full.
+        (one_pixel(depth=2), LAMP, 0.5 / 4),
+        (one_pixel(1, depth=2), LAMP, 0.75 / 4),
+        (one_pixel(2, depth=2), LAMP, 0.75 / 4),
+        # n = 6. Phong's angle is 60 degrees, its cosine to the sixth 1 / 64; Blinn's is 30.
+        (one_pixel(1), sun(*SLANTED), 0.25 + 0.25 / 64),
+        (one_pixel(2), sun(*SLANTED), 0.25 + 0.25 * 27 / 64),
+        # Light against the view has no direction halfway.
+        (one_pixel(2, normal=(0, 0, 1)), sun(0, 0, -1), 0.5),
+        (one_pixel(1, roughness=0), LAMP, 0.75),
+        (one_pixel(2, roughness=0), LAMP, 0.75),
+        (one_pixel(1, roughness=0), sun(*SLANTED), 0.25),
+        (one_pixel(2, roughness=0), sun(*SLANTED), 0.25),
+        # The length of a normal, which a file may round, is not brightness.
+        (one_pixel(2, normal=(0, 0, -1.01)), LAMP, 0.75),
+        # A cone whose border goes from 0 to 90 degrees: at 60, s is 1 / 2.
+        (one_pixel(), SpotLight([0, 0, 0], SLANTED, [4, 8, 12], 0, np.pi / 2), 0.25),
+        (one_pixel(), SpotLight([0, 0, 0], [1, 0, 1], [4, 8, 12], 0.8, 0.9), 0.5),
+        (one_pixel(), SpotLight([0, 0, 0], [1, 0, 1], [4, 8, 12], 0.6, 0.7), 0),
+        (one_pixel(), CLOSED, 0),
+        (one_pixel(-1, depth=np.inf), AmbientLight([4, 8, 12]), 0),
+        (one_pixel(-1), AmbientLight([np.inf] * 3), 0),
+        (one_pixel(2, depth=np.inf), LAMP, 0),
+        (one_pixel(1, normal=(0, 0, 0)), LAMP, 0),
+        (one_pixel(1, normal=(0, 0, 1)), LAMP, 0),
+    ],
+)
+def test_pixels_made_by_hand(gbuffer, light, expected):
+    result = relight.shade(gbuffer, FRONT, light)
+    np.testing.assert_allclose(result[0, 0], expected * np.array([4, 8, 12]), rtol=1e-12)
+
+
+@each_light
+@each_camera
+def test_both_modes_equal_finite_differences(camera, light):
+    gbuffer = make_gbuffer(3, 3, 4)
+    camera = make_camera(camera, 3, 4)
+    rng = np.random.default_rng(0)
+    weight = rng.normal(size=(3, 4, 3))
+    arguments, others = eqx.partition((gbuffer, camera, light), eqx.is_inexact_array)
+
+    def score(arguments):
+        return jnp.sum(weight * relight.shade(*eqx.combine(arguments, others)))
+
+    leaves, tree = jax.tree.flatten(arguments)
+    leaves = [np.array(leaf) for leaf in leaves]
+
+    def oracle(which, index, step):
+        moved = [leaf.copy() for leaf in leaves]
+        moved[which][index] += step
+        return np.sum(weight * loop(*eqx.combine(jax.tree.unflatten(tree, moved), others)))
+
+    along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), arguments)
+    reverse = jax.jit(jax.grad(score))(arguments)
+    forward = jax.jit(lambda arguments: jax.jvp(score, (arguments,), (along,))[1])(arguments)
+    still = set()
+    for which, (path, slopes) in enumerate(jax.tree.leaves_with_path(reverse)):
+        expected = np.zeros_like(leaves[which])
+        for index in np.ndindex(expected.shape):
+            ends = [oracle(which, index, step) for step in (1e-6, -1e-6)]
+            expected[index] = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-7)
+        if np.abs(expected).max() < 1e-5:
+            still.add(path[-1].name)
+    products = jax.tree.map(jnp.vdot, reverse, along)
+    np.testing.assert_allclose(forward, sum(jax.tree.leaves(products)), rtol=1e-10)
+    if isinstance(light, PointLight | SpotLight):
+        assert still == {"color", "ambient"}
+
+
+DEGENERATE = {
+    "light in the surface's plane": (one_pixel(1), sun(1, 0, 0)),
+    "mirror image across the view": (
+        one_pixel(1, normal=(np.sqrt(0.5), 0, -np.sqrt(0.5)), roughness=0.9),
+        sun(0, 0, 1),
+    ),
+    "light against the view": (one_pixel(2), sun(0, 0, -1)),
+    "light against the view, seen": (one_pixel(2, normal=(0, 0, 1)), sun(0, 0, -1)),
+    "roughness 0 at the peak": (one_pixel(2, roughness=0), LAMP),
+    "roughness 0 off the peak": (one_pixel(1, roughness=0), sun(*SLANTED)),
+    "roughness 1e-6": (one_pixel(2, roughness=1e-6), PointLight([1e-7, 0, 0], [1, 1, 1])),
+    "roughness 1": (one_pixel(1, roughness=1), sun(*SLANTED)),
+    "light at the surface": (one_pixel(2), PointLight([0, 0, 1], [1, 1, 1])),
+    "light just off it": (one_pixel(1), PointLight([0, 0, 1 - 1e-6], [1, 1, 1])),
+    "spot at the surface": (one_pixel(1), SpotLight([0, 0, 1], [0, 0, 1], [1, 1, 1], 0, 1)),
+    "spot on its axis": (one_pixel(1), AHEAD),
+    "spot turned away": (one_pixel(1), SpotLight([0, 0, 0], [0, 0, -1], [1, 1, 1], 0, np.pi)),
+    "spot that closes": (one_pixel(1), CLOSED),
+    "zero normal": (one_pixel(1, normal=(0, 0, 0)), LAMP),
+    "background": (one_pixel(-1, normal=(0, 0, 0), depth=np.inf, roughness=0), LAMP),
+    "a surface infinitely far": (one_pixel(2, depth=np.inf), LAMP),
+}
+
+
+@jax.jit
+def value_slope_and_curvature(arguments, shader):
+    """What a pixel shows, its derivatives, and theirs along one direction."""
+
+    def score(arguments):
+        floats, *others = arguments
+        return jnp.sum(relight.shade(eqx.combine(floats, shader), *others))
+
+    along = jax.tree.map(lambda leaf: jnp.cos(7 * leaf + 1), arguments)
+    along = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 1), along)
+    return jax.jvp(jax.value_and_grad(score), (arguments,), (along,))
+
+
+@pytest.mark.parametrize(("gbuffer", "light"), DEGENERATE.values(), ids=DEGENERATE.keys())
+def test_two_derivatives_are_finite_even_in_float32_at_degenerate_points(gbuffer, light):
+    floats, shader = eqx.partition(gbuffer, eqx.is_inexact_array)
+    arguments = cast((floats, FRONT, light), np.float32)
+    for leaf in jax.tree.leaves(value_slope_and_curvature(arguments, shader)):
+        assert np.isfinite(leaf).all()
+
+
+@pytest.mark.parametrize("shader", [1, 2])
+def test_sharp_highlights_and_narrow_cones_in_float32(shader):
+    """Where 1e-7 of a cosine, one rounding, is 2e-3 of the picture."""
+    width = 12
+    angles = np.linspace(0.001, 0.02, width)[None]
+    one = np.ones((1, width, 3))
+    gbuffer = GBuffer(
+        **dict.fromkeys(REFLECTANCES, one) | {"diffuse": 0 * one},
+        shader=np.full((1, width), shader),
+        normal=np.stack([np.sin(angles), 0 * angles, -np.cos(angles)], axis=-1),
+        depth=one[..., 0],
+        roughness=0.01 * one[..., 0],
+    )
+    camera = OrthographicCamera(1e3, [0, 0.5], np.eye(4))
+    for light in (sun(0, 0, 1), SpotLight([0, 0, 0], [0, 0, 1], [1, 1, 1], 0.002, 0.014)):
+        result = relight.shade(cast(gbuffer, np.float32), camera, light)
+        expected = loop(gbuffer, camera, light)
+        np.testing.assert_allclose(result, expected, rtol=2e-4, atol=1e-7)
+
+
+FIELDS = ("ambient", "diffuse", "specular", "normal", "depth", "roughness")
+
+
+@jax.jit
+def image_and_slopes(gbuffer, camera, lights):
+    """A picture and the derivatives of its sum in all that makes it."""
+    arguments, others = eqx.partition((gbuffer, camera, lights), eqx.is_inexact_array)
+    image = lambda arguments: relight.render(*eqx.combine(arguments, others))
+    out, pull = jax.vjp(image, arguments)
+    return out, *pull(jnp.ones_like(out))[0]
+
+
+@pytest.mark.parametrize("shader", [0, 1, 2])
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_nan_stays_in_its_pixel_and_is_not_hidden(field, shader):
+    gbuffer = make_gbuffer(5)
+    pixel = tuple(np.argwhere(np.asarray(gbuffer.shader) == shader)[0])
+    elsewhere = np.ones((7, 9), bool)
+    elsewhere[pixel] = False
+    select = lambda gbuffer: getattr(gbuffer, field)
+    wrong = eqx.tree_at(select, gbuffer, select(gbuffer).at[pixel].set(jnp.nan))
+    rest = make_camera("pinhole", 7, 9), list(LIGHTS.values())
+    good, bad = (image_and_slopes(gbuffer, *rest)[:2] for gbuffer in (gbuffer, wrong))
+    is_read = shader > 0 or field not in ("specular", "roughness")
+    assert np.isnan(bad[0][pixel]).all() == is_read
+    for one, other in zip(jax.tree.leaves(good), jax.tree.leaves(bad), strict=True):
+        assert np.isfinite(one).all()
+        assert np.array_equal(one[elsewhere], other[elsewhere])
+
+
+def test_background_is_black_whatever_it_holds():
+    gbuffer = make_gbuffer(6)
+    nothing = np.asarray(gbuffer.shader) == -1
+
+    def rubbish(leaf):
+        where = nothing if leaf.ndim == 2 else nothing[..., None]
+        return jnp.where(where, jnp.nan, leaf) if leaf.dtype == float else leaf
+
+    gbuffer = jax.tree.map(rubbish, gbuffer)
+    result = image_and_slopes(gbuffer, make_camera("pinhole", 7, 9), list(LIGHTS.values()))
+    assert np.all(result[0][nothing] == 0)
+    assert np.all(result[0][~nothing] > 0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
+
+
+@each_light
+def test_visibility_multiplies(light):
+    gbuffer, camera = make_gbuffer(1), make_camera("pinhole", 7, 9)
+    nothing = np.asarray(gbuffer.shader) == -1
+    visibility = np.where(nothing, np.nan, np.random.default_rng(0).random((7, 9)))
+    image = lambda light, visibility: relight.shade(gbuffer, camera, light, visibility)
+    plain = relight.shade(gbuffer, camera, light)
+    result, pull = jax.vjp(image, light, visibility)
+    expected = np.where(nothing[..., None], 0, plain * visibility[..., None])
+    np.testing.assert_allclose(result, expected, rtol=1e-13)
+    slopes, slope = pull(jnp.ones_like(result))
+    np.testing.assert_allclose(slope, plain.sum(axis=-1), rtol=1e-13)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+
+
+@each_camera
+def test_render_is_the_sum_of_lights(camera):
+    gbuffer, camera = make_gbuffer(2), make_camera(camera, 7, 9)
+    more = PointLight([0.5, 0.5, 1], [1.0, 0.5, 0.2])
+    lights = [more, *LIGHTS.values(), more]
+    expected = sum(loop(gbuffer, camera, light) for light in lights)
+    np.testing.assert_allclose(relight.render(gbuffer, camera, lights), expected, rtol=1e-10)
+    # Light of three times the colour is three times the light.
+    colors = lambda lights: [light.color for light in lights]
+    brighter = eqx.tree_at(colors, lights, [3 * light.color for light in lights])
+    np.testing.assert_allclose(
+        relight.render(gbuffer, camera, brighter), 3 * expected, rtol=1e-10
+    )
+
+
+def test_no_lights_are_black():
+    gbuffer = cast(make_gbuffer(0), np.float32)
+    image = relight.render(gbuffer, make_camera("pinhole", 7, 9), [])
+    assert (image.shape, image.dtype) == ((7, 9, 3), np.float32)
+    assert not image.any()
+
+
+def test_gradients_of_render_equal_finite_differences():
+    arguments = make_gbuffer(4), make_camera("pinhole", 7, 9), list(LIGHTS.values())
+    floats, shader = eqx.partition(arguments, eqx.is_inexact_array)
+    rng = np.random.default_rng(0)
+    along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), floats)
+
+    def total(step):
+        moved = jax.tree.map(lambda leaf, direction: leaf + step * direction, floats, along)
+        gbuffer, camera, lights = eqx.combine(moved, shader)
+        return sum(loop(gbuffer, camera, light).sum() for light in lights)
+
+    expected = (total(1e-6) - total(-1e-6)) / 2e-6
+    _, *reverse = image_and_slopes(*arguments)
+    products = jax.tree.map(jnp.vdot, tuple(reverse), along)
+    np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-7)
+    image = lambda floats: relight.render(*eqx.combine(floats, shader))
+    forward = jax.jit(lambda along: jax.jvp(image, (floats,), (along,))[1])(along)
+    np.testing.assert_allclose(forward.sum(), expected, rtol=1e-7)
+
+
+def test_reverse_memory_does_not_grow_with_the_lights():
+    size = 64
+    gbuffer = make_gbuffer(0, size, size, background=False)
+    camera = make_camera("pinhole", size, size)
+
+    def memory(count):
+        lights = [LIGHTS["point"]] * count
+        program = image_and_slopes.lower(gbuffer, camera, lights).compile()
+        return program.memory_analysis().temp_size_in_bytes
+
+    # Thirty more lights cost less than one more image.
+    assert memory(32) - memory(2) < size * size * 3 * 8
+
+
+def test_the_program_does_not_grow_with_the_picture():
+    def program(size):
+        gbuffer = make_gbuffer(0, size, size)
+        camera = make_camera("pinhole", size, size)
+        return jax.make_jaxpr(relight.shade)(gbuffer, camera, LIGHTS["spot"]).pretty_print()
+
+    small, large = program(8), program(320)
+    assert large.count(" = ") == small.count(" = ")
+    # The one loop is that of inverting the camera's 3x3 matrix.
+    loops = [line for line in large.splitlines() if "while[" in line or "scan[" in line]
+    assert not any("320" in line for line in loops)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-4), (np.float16, 2e-2)])
+def test_the_type_of_the_image_is_kept(dtype, tolerance):
+    camera, lights = make_camera("pinhole", 7, 9), list(LIGHTS.values())
+    gbuffer = make_gbuffer(1)
+    image = relight.render(cast(gbuffer, dtype), camera, lights)
+    assert image.dtype == dtype
+    expected = sum(loop(gbuffer, camera, light) for light in lights)
+    np.testing.assert_allclose(image, expected, rtol=tolerance, atol=tolerance)
+    visible = np.ones((7, 9))
+    assert relight.shade(cast(gbuffer, dtype), camera, lights[2], visible).dtype == dtype
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (6, 1)])
+def test_any_size_and_batches_of_lights(size):
+    gbuffer, camera = make_gbuffer(0, *size, background=False), make_camera("pinhole", *size)
+    lights = [LIGHTS["spot"], jax.tree.map(lambda leaf: leaf * 1.01, LIGHTS["spot"])]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *lights)
+    images = jax.vmap(lambda light: relight.shade(gbuffer, camera, light))(batch)
+    expected = np.stack([loop(gbuffer, camera, light) for light in lights])
+    np.testing.assert_allclose(images, expected, rtol=1e-10)
+    images = jax.vmap(lambda light: relight.render(gbuffer, camera, [light, lights[0]]))(batch)
+    np.testing.assert_allclose(images, expected + expected[0], rtol=1e-10)
+
+
+def test_an_unknown_shader_is_named_or_black():
+    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1 or 2"):
+        relight.shade(one_pixel(3), FRONT, LIGHTS["ambient"])
+    assert not jax.jit(relight.shade)(one_pixel(3), FRONT, LIGHTS["ambient"]).any()
+
+
+def test_faults_name_the_argument():
+    shade, render = inspect.unwrap(relight.shade), inspect.unwrap(relight.render)
+    gbuffer, camera, light = make_gbuffer(0), make_camera("pinhole", 7, 9), LIGHTS["point"]
+    kinds = "AmbientLight, DirectionalLight, PointLight, SpotLight"
+    for visibility in (np.ones((9, 7)), np.ones((7, 9, 1)), 1.0):
+        with pytest.raises(ValueError, match=r"`shade\(visibility\)` must have shape \(7, 9\)"):
+            shade(gbuffer, camera, light, visibility)
+    with pytest.raises(ValueError, match=r"`shade\(visibility\)` must be a real number"):
+        shade(gbuffer, camera, light, np.ones((7, 9), bool))
+    with pytest.raises(ValueError, match=rf"`shade\(light\)` must be one of {kinds}, got str"):
+        shade(gbuffer, camera, "sun")
+    with pytest.raises(ValueError, match=r"`render\(lights\[1\]\)` must be one of .*, got int"):
+        render(gbuffer, camera, [light, 3])
+    with pytest.raises(
+        ValueError, match=r"`render\(lights\)` must be a sequence .* PointLight"
+    ):
+        render(gbuffer, camera, light)
+    edited = eqx.tree_at(lambda gbuffer: gbuffer.normal, gbuffer, gbuffer.normal[:-1])
+    for call, lights in ((shade, light), (render, [])):
+        with pytest.raises(
+            ValueError, match=r"`GBuffer\(normal\)` must have shape \(7, 9, 3\)"
+        ):
+            call(edited, camera, lights)

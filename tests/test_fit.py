@@ -1,0 +1,226 @@
+"""The fit of scatter: what made a picture is found in it; what can't be found is said."""
+
+import functools
+import inspect
+import itertools
+import re
+
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jaxfx import FocusPlanes, ThinLens, dof, fit
+
+
+SIZE = 48
+TRUTH = {"aperture": 0.12, "focus_distance": 3.0, "gamma": 1.5, "epsilon": 2.0}
+# How far off a start may be, as a factor, to one side and to the other.
+WRONG = {
+    "aperture": (0.6, 1.4),
+    "focus_distance": (0.85, 1.15),
+    "gamma": (1 / 2.5, 2.5),
+    "epsilon": (1 / 2.5, 2.5),
+}
+
+
+def still_life(size=SIZE):
+    """A checkered floor that rises into the distance, and four discs before and behind it."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:size, :size] / size
+    c = np.arange(3)
+    checks = np.sin(40 * x[..., None] + 3 * c) * np.cos(31 * y[..., None] - c) > 0
+    image = 0.2 + 0.6 * checks + 0.2 * rng.random((size, size, 3))
+    depth = 3 + 4 * y
+    discs = [
+        (0.3, 0.4, 0.15, 1.5),
+        (0.7, 0.6, 0.2, 2.2),
+        (0.5, 0.8, 0.1, 3),
+        (0.8, 0.2, 0.15, 10),
+    ]
+    for centre_x, centre_y, radius, z in discs:
+        inside = (x - centre_x) ** 2 + (y - centre_y) ** 2 < radius**2
+        image[inside], depth[inside] = rng.random(3), z
+    return image, depth
+
+
+def options(values, dtype=np.float64):
+    """The arguments that `scatter` and `fit.dof` share, from values by name."""
+    values = {name: jnp.asarray(value, dtype) for name, value in values.items()}
+    focal_pixels = jnp.asarray(120.0, dtype)
+    lens = ThinLens(values["aperture"], values["focus_distance"], focal_pixels)
+    return {"lens": lens, "gamma": values["gamma"], "epsilon": values["epsilon"]}
+
+
+def wrong(sides):
+    return {
+        name: TRUTH[name] * WRONG[name][side] for name, side in zip(TRUTH, sides, strict=True)
+    }
+
+
+def found(fitted):
+    lens = fitted.lens
+    values = (lens.aperture, lens.focus_distance, fitted.gamma, fitted.epsilon)
+    return dict(zip(fit.PARAMETERS, map(float, values), strict=True))
+
+
+@functools.cache
+def picture(dtype=np.float64):
+    image, depth = (array.astype(dtype) for array in still_life())
+    return dof.scatter(image, depth, **options(TRUTH, dtype)), image, depth
+
+
+def quietly(reference, image, depth, values=TRUTH, max_coc=8, **kwargs):
+    arguments = options(values, image.dtype) | kwargs
+    return fit.dof(reference, image, depth, max_coc=max_coc, progress=False, **arguments)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("sides", list(itertools.product((0, 1), repeat=4)), ids=str)
+def test_recovers_what_made_the_picture(sides, dtype):
+    fitted = quietly(*picture(dtype), wrong(sides))
+    assert fitted.success
+    assert fitted.image.dtype == fitted.gamma.dtype == dtype
+    assert fitted.clamped == 0
+    assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
+    assert fitted.losses[-1] < 1e-3 * fitted.losses[0]
+    # Three searches, none of which goes on for long once it has arrived.
+    assert len(fitted.losses) < 80
+
+
+def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
+    reference, image, depth = picture()
+    start = dof.scatter(image, depth, **options(wrong((1, 1, 1, 1))))
+    fitted = quietly(reference, image, depth, wrong((1, 1, 1, 1)))
+    np.testing.assert_allclose(fitted.losses[0], jnp.mean((start - reference) ** 2))
+    again = dof.scatter(image, depth, **options(found(fitted)))
+    np.testing.assert_allclose(fitted.image, again, atol=1e-12)
+
+
+def test_a_search_that_runs_out_of_room_goes_on_with_more():
+    fitted = quietly(*picture(), wrong((0, 0, 1, 1)), max_coc=None)
+    assert fitted.success and fitted.clamped == 0
+    assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
+
+
+def test_says_what_was_clamped():
+    reference, image, depth = picture()
+    fitted = quietly(reference, image, depth, parameters=("gamma",), max_coc=3.5)
+    share = np.mean(fitted.lens.circle_of_confusion(jnp.asarray(depth)) > 3.5)
+    assert 0 < share < 1
+    assert fitted.clamped == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    "free", [("aperture", "focus_distance"), ("epsilon", "gamma")], ids="-".join
+)
+def test_what_is_frozen_stays(free):
+    start = TRUTH | {name: wrong((1, 1, 1, 1))[name] for name in free}
+    fitted = quietly(*picture(), start, parameters=free)
+    assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
+    assert all(found(fitted)[name] == TRUTH[name] for name in TRUTH if name not in free)
+    assert set(fitted.uncertainty) == set(free)
+
+
+TOLERANCE = {"rtol": 1e-6, "atol": 1e-8}
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        optx.GaussNewton(**TOLERANCE),
+        optx.Dogleg(**TOLERANCE),
+        optx.BFGS(**TOLERANCE),
+    ],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_any_solver_or_minimiser(solver):
+    fitted = quietly(
+        *picture(),
+        TRUTH | {"aperture": 0.13, "focus_distance": 3.1},
+        parameters=("aperture", "focus_distance"),
+        solver=solver,
+    )
+    assert fitted.success
+    assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
+
+
+def test_failure_is_said():
+    start = wrong((0, 1, 0, 1))
+    with pytest.raises(RuntimeError, match=r"no fit in \d+ steps.*from [\de.-]+ to [\de.-]+"):
+        quietly(*picture(), start, max_steps=3)
+    fitted = quietly(*picture(), start, max_steps=3, throw=False)
+    assert not fitted.success
+    assert fitted.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert np.isfinite(fitted.losses).all()
+
+
+def behind_the_focus():
+    """A textured plane far behind the focus, where neither visibility has a say."""
+    image, _ = still_life()
+    depth = np.full(image.shape[:2], 9.0)
+    values = TRUTH | {"epsilon": 1.0}
+    reference = dof.scatter(image, depth, **options(values))
+    noise = np.random.default_rng(1).normal(0, 0.01, image.shape)
+    return reference + noise, image, depth, values
+
+
+def test_a_solver_that_breaks_down_leaves_what_it_had():
+    # Without damping, a parameter without a derivative is a division by zero.
+    reference, image, depth, values = behind_the_focus()
+    solver = optx.GaussNewton(linear_solver=lx.QR(), **TOLERANCE)
+    fitted = quietly(reference, image, depth, values, solver=solver, throw=False)
+    assert not fitted.success
+    assert found(fitted) == pytest.approx(values)
+
+
+def test_what_the_picture_cannot_tell_is_uncertain():
+    fitted = quietly(*behind_the_focus())
+    assert fitted.uncertainty["gamma"] == fitted.uncertainty["epsilon"] == np.inf
+    # One plane has one circle of confusion: the aperture or the focus may have made it.
+    assert fitted.uncertainty["aperture"] > TRUTH["aperture"]
+    alone = quietly(*behind_the_focus(), parameters=("aperture",))
+    assert alone.uncertainty["aperture"] < 0.01 * TRUTH["aperture"]
+
+
+def test_uncertainty_is_the_spread_over_draws_of_noise():
+    reference, image, depth = picture()
+    rng = np.random.default_rng(2)
+    misses = []
+    for _ in range(24):
+        fitted = quietly(reference + rng.normal(0, 0.01, reference.shape), image, depth)
+        values = found(fitted)
+        misses.append(
+            [(values[name] - TRUTH[name]) / fitted.uncertainty[name] for name in TRUTH]
+        )
+    # By the median: one draw in eight makes epsilon's other minimum, at 1.4, the lower one.
+    spread = np.median(np.abs(misses), axis=0) / 0.6745
+    assert ((spread > 0.5) & (spread < 2)).all(), spread
+
+
+FAULTS = {
+    "dof(image)": {"image": np.zeros((4, 4), np.float64)},
+    "dof(image) must hold floats": {"image": np.zeros((SIZE, SIZE, 3), np.uint8)},
+    "dof(reference)": {"reference": np.zeros((SIZE, SIZE - 1, 3))},
+    "dof(reference) must be finite": {"reference": np.full((SIZE, SIZE, 3), np.nan)},
+    "dof(depth)": {"depth": np.ones((SIZE, SIZE + 1))},
+    "dof(depth) must be positive": {"depth": np.zeros((SIZE, SIZE))},
+    "dof(lens)": {"lens": FocusPlanes(1.0, 2.0, 3.0, 4.0)},
+    "dof(lens.aperture)": {"lens": ThinLens(0.0, 3.0, 120.0)},
+    "dof(gamma=...)": {"gamma": -1.0},
+    "dof(epsilon=...)": {"epsilon": np.zeros(2)},
+    "dof(parameters=...)": {"parameters": ("aperture", "focal_pixels")},
+    "dof(parameters=...) must name some": {"parameters": ()},
+    "dof(max_steps=...)": {"max_steps": 0},
+    "scatter(max_coc=...)": {"max_coc": -1},
+}
+
+
+@pytest.mark.parametrize(("message", "fault"), FAULTS.items(), ids=FAULTS)
+def test_bad_arguments_are_named(message, fault):
+    reference, image, depth = picture()
+    given = {"reference": reference, "image": image, "depth": depth} | options(TRUTH)
+    call, _, rest = message.partition(" ")
+    with pytest.raises(ValueError, match=re.escape(f"`{call}` {rest}")):
+        inspect.unwrap(fit.dof)(**given | {"progress": False} | fault)
