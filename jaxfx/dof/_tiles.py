@@ -21,6 +21,7 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float, Int
 
 from jaxfx._numerics import clip01
+from jaxfx.dof._shift import shift
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites
 
 
@@ -40,7 +41,7 @@ class _Planes(NamedTuple):
 def tiles(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
     """The sums over all sprites that reach at most `reach` pixels along an axis."""
     value, radius, leak, coc, epsilon = sprites
-    planes = _Planes(jnp.moveaxis(value, -1, 0), radius, leak / epsilon, coc / epsilon)
+    planes = _Planes(_stacked(value), radius, leak / epsilon, coc / epsilon)
     return jnp.moveaxis(_sums(reach, planes), 0, -1)
 
 
@@ -55,36 +56,36 @@ def _sums_jvp(reach, primals, tangents):
     push = sequential_vmap(ft.partial(_tangent, reach))
     pull = sequential_vmap(ft.partial(_adjoint, reach))
 
-    # The tangent S is linear, and its transpose is a kernel of its own. JAX is told so by the
-    # one call that takes both and can be mapped and transposed: a solve by [[0, S^T], [S, 0]],
-    # which is symmetric. Of each of its two sums XLA drops the one that nobody reads. The
-    # system itself would be wanted by a second derivative only, which `_once` refuses.
-    planes = _once(planes)
-    # A solve is transposed in the whole of b: what has no tangent borrows a zero from what has.
+    def sums(planes):
+        value, radius, leak, coc = planes
+        one = jnp.ones((), radius.dtype)
+        return _stacked(
+            shift(Sprites(jnp.moveaxis(value, 0, -1), radius, leak, coc, one), reach)
+        )
+
+    # The tangent is linear, S say, and its transpose a kernel of its own. JAX is told so by the
+    # one call that takes both and can be mapped, transposed and differentiated: the solve of
+    # (u, v - S u) = b, which is (u, v + S u), and for the adjoint (u + S^T v, v). The system
+    # itself is wanted by second derivatives only, and may be slow: there S is that of `shift`.
+    def matvec(b):
+        return b[0], b[1] - jax.jvp(sums, (planes,), (b[0],))[1]
+
+    def solve(_, b):
+        return b[0], b[1] + push(planes, b[0])
+
+    def solve_transposed(_, b):
+        return jax.tree.map(jnp.add, b[0], pull(planes, b[1])), b[1]
+
+    # It is transposed in the whole of b: what has no tangent borrows a zero from what has.
     leaves = jax.tree.leaves(tangent)
     zero = sum(jnp.where(False, leaf.ravel()[0], 0) for leaf in leaves)
-    tangent = jax.tree.map(lambda leaf: leaf + zero, tangent)
-    _, out = jax.lax.custom_linear_solve(
-        lambda b: b,
-        (tangent, zero + jnp.zeros_like(planes.value)),
-        lambda _, b: (pull(planes, b[1]), push(planes, b[0])),
-        symmetric=True,
-    )
+    b = jax.tree.map(lambda x: x + zero, (tangent, jnp.zeros_like(planes.value)))
+    _, out = jax.lax.custom_linear_solve(matvec, b, solve, solve_transposed)
     return _sums(reach, planes), out
 
 
-@jax.custom_jvp
-def _once(planes: _Planes) -> _Planes:
-    """The same planes, which can't be differentiated."""
-    return planes
-
-
-@_once.defjvp
-def _once_jvp(primals, tangents):
-    raise NotImplementedError(
-        '`scatter(kernel=...)` must be "shift" or "segment_sum" for second derivatives, '
-        'got "tiles".'
-    )
+def _stacked(value: Float[Array, "height width value"]) -> Float[Array, "value height width"]:
+    return jnp.moveaxis(value, -1, 0)
 
 
 def _forward(reach: int, planes: _Planes) -> Float[Array, "value height width"]:
@@ -141,12 +142,14 @@ def _adjoint(reach: int, planes: _Planes, bar: Float[Array, "value height width"
         return [cover * (sharp * _inside(rise) + blurring * _clip(rise)) * product]
 
     own, other = [value, leak], [bar, coc, sharp]
-    of_sources = _sweep(to_source, reach, radius, own, other, by_source=True, slopes=True)
+    value_bar, radius_bar, leak_bar = _sweep(
+        to_source, reach, radius, own, other, by_source=True, slopes=True
+    )
     own, other = [bar, coc, sharp, blurring], [value, leak]
     (coc_bar,) = _sweep(
         to_destination, reach, radius, own, other, by_source=False, slopes=False
     )
-    return _Planes(*of_sources, coc_bar)
+    return _Planes(value_bar, radius_bar, leak_bar, coc_bar)
 
 
 def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -178,11 +181,11 @@ def _sweep(
     its radius. `tap` gives planes or stacks of them, and their sums come back.
     """
     height, width = radius.shape
-    tall, wide = (min(side, -(-n // 8) * 8) for side, n in zip(TILE, radius.shape, strict=True))
+    tall, wide = min(TILE[0], -(-height // 8) * 8), min(TILE[1], -(-width // 8) * 8)
     rows, columns = -(-height // tall), -(-width // wide)
-    reaches = _tile_reaches(radius, (tall, wide), spread=not by_source)
+    reaches = _tile_reaches(radius, tall, wide, spread=not by_source)
 
-    def padded(planes, fill=0):
+    def padded(planes, fill=0.0):
         sides = ((reach, reach + rows * tall - height), (reach, reach + columns * wide - width))
         margin = [(0, 0)] * (planes.ndim - 2) + [*sides]
         return jnp.pad(planes, margin, constant_values=fill)
@@ -250,9 +253,10 @@ def _rows(planes: Array, start: Array, size: int) -> Array:
 
 
 def _tile_reaches(
-    radius: Float[Array, "height width"], tile: tuple[int, int], *, spread: bool
+    radius: Float[Array, "height width"], tall: int, wide: int, *, spread: bool
 ) -> Int[Array, " tile"]:
     """How far the sprites of a tile reach or, with `spread`, those that reach the tile."""
+    tile = (tall, wide)
     counts = [-(-n // side) for n, side in zip(radius.shape, tile, strict=True)]
     margin = [(0, m * side - n) for n, m, side in zip(radius.shape, counts, tile, strict=True)]
     blocks = jnp.pad(radius, margin).reshape(counts[0], tile[0], counts[1], tile[1])

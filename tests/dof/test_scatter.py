@@ -338,7 +338,7 @@ def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
     assert np.isfinite(forward(inputs, jax.tree.map(jnp.ones_like, inputs)))
 
 
-@pytest.mark.parametrize("kernel", ["segment_sum", "shift"])
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_second_derivatives(kernel):
     inputs = inputs_of(13)
     names = ("aperture", "focus_distance", "gamma", "epsilon")
@@ -353,15 +353,6 @@ def test_second_derivatives(kernel):
     expected = [differences(lambda t, e=e: gradient(x + t * e), 0.0) for e in jnp.eye(4)]
     np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-10)
-
-
-def test_tiles_refuse_second_derivatives():
-    image, depth = random_scene(13)
-    loss = lambda a: dof.scatter(
-        image, depth, ThinLens(a, 2.5, 60.0), max_coc=6, kernel="tiles"
-    ).sum()
-    with pytest.raises(NotImplementedError, match='"shift" or "segment_sum"'):
-        jax.jacfwd(jax.grad(loss))(0.1)
 
 
 def test_half_images_keep_their_type():
