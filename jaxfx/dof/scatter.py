@@ -27,8 +27,8 @@ from jaxfx.lens import FocusPlanes, ThinLens
 Kernel = Literal["auto", "segment_sum", "shift", "tiles"]
 Coverage = Literal["area", "indicator"]
 
-# Where "shift" adds fewer taps than this it takes some 5 ms, and compiles sooner than "tiles".
-_FEW_TAPS = 2**22
+# Where "shift" adds fewer taps than this it takes some 15 ms, and compiles sooner than "tiles".
+_FEW_TAPS = 2**23
 
 # Visibility stays below e**60, so that its sums with highlights are finite in float32.
 _LOG_VISIBILITY = 60.0
