@@ -12,6 +12,7 @@ with the square of the radius.
 import functools as ft
 import math
 from collections.abc import Callable
+from itertools import count, takewhile
 from typing import NamedTuple
 
 import jax
@@ -27,6 +28,9 @@ from jaxfx.dof._sprites import POINT_RADIUS, Sprites
 
 # Tall enough to spread a row's overhead, wide for the vector units, small enough for the cache.
 TILE = (64, 128)
+# A row of fewer than 17 taps takes XLA three times as long a tap: it reads every one through a
+# dynamic slice, which it lays out in memory for more readers than 16.
+LEAST_HALO = 8
 
 
 class _Planes(NamedTuple):
@@ -183,15 +187,16 @@ def _sweep(
     height, width = radius.shape
     tall, wide = min(TILE[0], -(-height // 8) * 8), min(TILE[1], -(-width // 8) * 8)
     rows, columns = -(-height // tall), -(-width // wide)
+    most = max(LEAST_HALO, reach)
     reaches = _tile_reaches(radius, tall, wide, spread=not by_source)
 
     def padded(planes, fill=0.0):
-        sides = ((reach, reach + rows * tall - height), (reach, reach + columns * wide - width))
+        sides = ((most, most + rows * tall - height), (most, most + columns * wide - width))
         margin = [(0, 0)] * (planes.ndim - 2) + [*sides]
         return jnp.pad(planes, margin, constant_values=fill)
 
     def cut(planes, index, halo):
-        start = (index // columns * tall + reach - halo, index % columns * wide + reach - halo)
+        start = (index // columns * tall + most - halo, index % columns * wide + most - halo)
         planes = jax.lax.dynamic_slice_in_dim(planes, start[0], tall + 2 * halo, axis=-2)
         return jax.lax.dynamic_slice_in_dim(planes, start[1], wide + 2 * halo, axis=-1)
 
@@ -214,10 +219,7 @@ def _sweep(
             def add_side(side, sums):
                 shift = ft.partial(_rows, start=halo + (1 - 2 * side) * row, size=tall)
                 there = [*map(shift, theirs)]
-                # The middle row is its own mirror image, and counts once.
-                once = jnp.where((row > 0) | (side == 0), 1, 0).astype(sprite.dtype)
-                spans = [once * x for x in widths]
-                spans = spans if by_source else [*map(shift, spans)]
+                spans = widths if by_source else [*map(shift, widths)]
                 for column in range(-halo, halo + 1):
                     at = slice(halo + column, halo + column + wide)
                     span = spans if by_source else [x[:, at] for x in spans]
@@ -225,7 +227,8 @@ def _sweep(
                     sums = [x + y for x, y in zip(sums, taps, strict=True)]
                 return sums
 
-            return jax.lax.fori_loop(0, 2, add_side, sums), upper
+            # The middle row is its own mirror image.
+            return jax.lax.fori_loop(0, jnp.where(row > 0, 2, 1), add_side, sums), upper
 
         nothing = [jnp.zeros((tall, wide), sprite.dtype)] * (2 if slopes else 1)
         shapes = jax.eval_shape(tap, *nothing, mine, [x[..., :tall, :wide] for x in theirs])
@@ -233,7 +236,8 @@ def _sweep(
         lower = [-x for x in _integral(sprite, jnp.asarray(0.5, sprite.dtype), slopes)]
         return jax.lax.fori_loop(0, reaches[index] + 1, add_row, (sums, lower))[0]
 
-    halos = sorted({0, -(-reach // 2), reach})
+    doubled = takewhile(lambda halo: halo < most, (LEAST_HALO << n for n in count()))
+    halos = [0, *doubled, most]
     branches = [ft.partial(tile, halo) for halo in halos]
 
     def one(index):
