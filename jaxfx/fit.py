@@ -324,11 +324,11 @@ def _new_state(solver: Any, fn: _Objective, y: _Unknowns) -> Any:
     return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
 
 
-def _arrays(state: Any) -> list[Array]:
+def _arrays(state: Any) -> list[Any]:
     return jax.tree.leaves(eqx.filter(state, eqx.is_array))
 
 
-def _state(solver: Any, fn: _Objective, y: _Unknowns, arrays: list[Array]) -> Any:
+def _state(solver: Any, fn: _Objective, y: _Unknowns, arrays: list[Any]) -> Any:
     old, static = eqx.partition(_new_state(solver, fn, y), eqx.is_array)
     return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), arrays), static)
 
