@@ -1,9 +1,8 @@
-"""Parameters of the effects from pictures, by optimistix."""
+"""The lens and the amplifications of a picture with depth of field."""
 
-import functools
 import math
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -15,10 +14,9 @@ from tqdm.auto import tqdm
 
 from jaxfx._numerics import check, check_depth, check_image, parameter
 from jaxfx.dof.scatter import largest_coc, scatter
+from jaxfx.fit._descent import End, Solver, descend, standard_errors
 from jaxfx.lens import ThinLens
 
-
-__all__ = ["PARAMETERS", "DofFit", "dof"]
 
 PARAMETERS = ("aperture", "focus_distance", "gamma", "epsilon")
 
@@ -28,9 +26,6 @@ _EPSILON_RESTARTS = (2.0, 0.5)
 # How much larger than its start's largest circle of confusion a search may draw, and how often
 # one goes on with more room from where it ran out.
 _ROOM, _ROUNDS = 1.5, 4
-# Our own solver has also converged when so many steps make the loss smaller by less than this
-# share: in float32, rounding hides from it that it has arrived.
-_PATIENCE, _GAIN = 6, 1e-5
 
 _Unknowns = dict[str, Float[Array, ""]]
 
@@ -77,7 +72,7 @@ def dof(
     gamma: Float[ArrayLike, ""] | float = 1.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
     max_coc: int | float | None = None,
-    solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None = None,
+    solver: Solver | None = None,
     parameters: Collection[str] = PARAMETERS,
     max_steps: int = 64,
     throw: bool = True,
@@ -120,7 +115,9 @@ def dof(
         raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
     model = _Model(image, depth, lens.focal_pixels, start, max_coc)
     with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
-        solve = lambda model, y: _solve(model, reference, y, solver, max_steps, bar)
+        solve = lambda model, y: descend(
+            _Residual(model, reference), y, solver=solver, max_steps=max_steps, bar=bar
+        )
         model, end = _search(model, unknowns, solve)
     if throw and end.result != optx.RESULTS.successful:
         raise RuntimeError(
@@ -132,13 +129,14 @@ def dof(
     found = _constrain(end.unknowns, image.dtype)
     values = start | found
     fitted = _drawn(model, found)
+    errors = standard_errors(_columns(model, found), fitted - reference)
     return DofFit(
         model.lens(found),
         values["gamma"],
         values["epsilon"],
         fitted,
         jnp.stack(end.losses),
-        _standard_errors(model, found, fitted - reference),
+        dict(zip(found, errors, strict=True)),
         model.clamped(found),
         end.result,
     )
@@ -229,17 +227,9 @@ class _Model(eqx.Module):
         return jnp.mean(self.lens(values).circle_of_confusion(self.depth) > self.max_coc)
 
 
-class _End(NamedTuple):
-    """Where a solver stopped, the losses at its start and after every step, its verdict."""
-
-    unknowns: _Unknowns
-    losses: list[Float[Array, ""]]
-    result: optx.RESULTS
-
-
 def _search(
-    model: _Model, unknowns: _Unknowns, solve: Callable[[_Model, _Unknowns], _End]
-) -> tuple[_Model, _End]:
+    model: _Model, unknowns: _Unknowns, solve: Callable[[_Model, _Unknowns], End]
+) -> tuple[_Model, End]:
     """The best end from `unknowns`, under the first model that has room for it."""
     fixed = model.max_coc is not None
     values = lambda unknowns: _constrain(unknowns, model.image.dtype)
@@ -261,99 +251,15 @@ def _search(
     return model, end._replace(losses=losses)
 
 
-def _solve(
-    model: _Model,
-    reference: Float[Array, "height width channel"],
-    y: _Unknowns,
-    solver: Any,
-    max_steps: int,
-    bar: tqdm,
-) -> _End:
-    """From a start to its end, one step at a time, to keep every loss."""
-    patience = _PATIENCE if solver is None else max_steps
-    solver = _default_solver() if solver is None else solver
-    fn = _Objective(model, reference, isinstance(solver, optx.AbstractMinimiser))
-    state = _begin(solver, fn, y)
-    losses, lowest, best, waited = [], math.inf, y, 0
-    verdict = optx.RESULTS.nonlinear_max_steps_reached
-    for _ in range(max_steps):
-        given = y
-        y, state, loss, done, result = _step(solver, fn, y, state)
-        losses.append(loss)
-        bar.update()
-        bar.set_postfix(mse=f"{float(loss):.3g}")
-        waited = waited + 1 if loss > (1 - _GAIN) * lowest else 0
-        if loss < lowest:
-            lowest, best = float(loss), given
-        if done or waited >= patience or result != optx.RESULTS.successful:
-            verdict = result
-            break
-    y = _finish(solver, fn, y, state, losses[-1], verdict)
-    loss = _loss(fn, y)
-    if not math.isfinite(loss):
-        y, loss, verdict = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
-    return _End(y, [*losses, loss], verdict)
-
-
-class _Objective(eqx.Module):
-    """What a solver is given: the residual or, for a minimiser, its mean square; and that."""
+class _Residual(eqx.Module):
+    """The picture less the reference, as a function of what is searched."""
 
     model: _Model
     reference: Float[Array, "height width channel"]
-    scalar: bool = eqx.field(static=True)
 
-    def __call__(self, unknowns: _Unknowns, _: None) -> tuple[Array, Array]:
+    def __call__(self, unknowns: _Unknowns) -> Float[Array, "height width channel"]:
         values = _constrain(unknowns, self.reference.dtype)
-        residual = (self.model(values) - self.reference).astype(float)
-        loss = jnp.mean(residual * residual)
-        return (loss if self.scalar else residual), loss
-
-
-@functools.cache
-def _default_solver() -> optx.LevenbergMarquardt:
-    return optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
-
-
-# A solver's state holds functions, which `jit` compares by identity. Only its arrays leave a
-# compiled function, and go back into a state made anew: so all searches share one program.
-_REST = {"args": None, "options": {}, "tags": frozenset()}
-
-
-def _new_state(solver: Any, fn: _Objective, y: _Unknowns) -> Any:
-    out, loss = eqx.filter_eval_shape(fn, y, None)
-    return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
-
-
-def _arrays(state: Any) -> list[Any]:
-    return jax.tree.leaves(eqx.filter(state, eqx.is_array))
-
-
-def _state(solver: Any, fn: _Objective, y: _Unknowns, arrays: list[Any]) -> Any:
-    old, static = eqx.partition(_new_state(solver, fn, y), eqx.is_array)
-    return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), arrays), static)
-
-
-@eqx.filter_jit
-def _begin(solver, fn, y):
-    return _arrays(_new_state(solver, fn, y))
-
-
-@eqx.filter_jit
-def _step(solver, fn, y, arrays):
-    # The loss is that of the `y` that was given.
-    y, state, loss = solver.step(fn, y, state=_state(solver, fn, y, arrays), **_REST)
-    return y, _arrays(state), loss, *solver.terminate(fn, y, state=state, **_REST)
-
-
-@eqx.filter_jit
-def _finish(solver, fn, y, arrays, loss, result):
-    state = _state(solver, fn, y, arrays)
-    return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[0]
-
-
-@eqx.filter_jit
-def _loss(fn, y):
-    return fn(y, None)[1]
+        return (self.model(values) - self.reference).astype(float)
 
 
 @eqx.filter_jit
@@ -362,22 +268,7 @@ def _drawn(model, values):
 
 
 @eqx.filter_jit
-def _jacobian(model, values):
-    return jax.jacfwd(model)(values)
-
-
-def _standard_errors(
-    model: _Model, values: _Unknowns, residual: Array
-) -> dict[str, Float[Array, ""]]:
-    """Square roots of the diagonal of `sigma**2 (J^T J)^-1`, J by forward mode."""
-    jacobian = _jacobian(model, values)
-    columns = jnp.stack([jacobian[name].reshape(-1) for name in values], axis=1)
-    norms = jnp.linalg.norm(columns, axis=0)
-    known = norms > 0
-    scaled = columns / jnp.where(known, norms, 1)[None]
-    eigenvalues, vectors = jnp.linalg.eigh(scaled.T @ scaled)
-    floor = jnp.finfo(columns.dtype).eps
-    variance = jnp.sum(vectors**2 / jnp.maximum(eigenvalues, floor)[None], axis=1)
-    sigma = jnp.sqrt(jnp.sum(residual**2) / max(residual.size - len(values), 1))
-    errors = jnp.where(known, sigma * jnp.sqrt(variance) / norms, jnp.inf)
-    return dict(zip(values, errors, strict=True))
+def _columns(model, values):
+    """The Jacobian in the order of `values`, by forward mode."""
+    jacobian = jax.jacfwd(model)(values)
+    return jnp.stack([jacobian[name].reshape(-1) for name in values], axis=1)

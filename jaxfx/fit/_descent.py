@@ -1,0 +1,143 @@
+"""Nonlinear least squares by any solver of optimistix, one step at a time, every loss kept."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+from tqdm.auto import tqdm
+
+
+Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+
+# Our own solver has also converged when so many steps make the loss smaller by less than this
+# share: in float32, rounding hides from it that it has arrived.
+_PATIENCE, _GAIN = 6, 1e-5
+
+
+class End(NamedTuple):
+    """Where a solver stopped, the losses at its start and after every step, its verdict."""
+
+    unknowns: Any
+    losses: list[Float[Array, ""]]
+    result: optx.RESULTS
+
+
+def descend(
+    residual: Callable[[Any], Float[Array, "..."]],
+    unknowns: Any,
+    *,
+    solver: Solver | None,
+    max_steps: int,
+    bar: tqdm,
+) -> End:
+    """From a start to the end that a solver finds, Levenberg-Marquardt if none is given.
+
+    `residual` is an `equinox.Module`, from a pytree of numbers in JAX's default type to an
+    array of that type: its class and shapes decide what is compiled anew. The loss is its mean
+    square.
+    """
+    patience = _PATIENCE if solver is None else max_steps
+    solver = _default_solver() if solver is None else solver
+    fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
+    y, state = unknowns, _begin(solver, fn, unknowns)
+    losses, lowest, best, waited = [], math.inf, y, 0
+    verdict = optx.RESULTS.nonlinear_max_steps_reached
+    for _ in range(max_steps):
+        given = y
+        y, state, loss, done, result = _step(solver, fn, y, state)
+        losses.append(loss)
+        bar.update()
+        bar.set_postfix(mse=f"{float(loss):.3g}")
+        waited = waited + 1 if loss > (1 - _GAIN) * lowest else 0
+        if loss < lowest:
+            lowest, best = float(loss), given
+        if done or waited >= patience or result != optx.RESULTS.successful:
+            verdict = result
+            break
+    y = _finish(solver, fn, y, state, losses[-1], verdict)
+    loss = _loss(fn, y)
+    if not math.isfinite(loss):
+        y, loss, verdict = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
+    return End(y, [*losses, loss], verdict)
+
+
+class _Objective(eqx.Module):
+    """What a solver is given: the residual or, for a minimiser, its mean square; and that."""
+
+    residual: Callable[[Any], Float[Array, "..."]]
+    scalar: bool = eqx.field(static=True)
+
+    def __call__(self, unknowns: Any, _: None) -> tuple[Array, Array]:
+        residual = self.residual(unknowns)
+        loss = jnp.mean(residual * residual)
+        return (loss if self.scalar else residual), loss
+
+
+@functools.cache
+def _default_solver() -> optx.LevenbergMarquardt:
+    return optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+
+
+# A solver's state holds functions, which `jit` compares by identity. Only its arrays leave a
+# compiled function, and go back into a state made anew: so all searches share one program.
+_REST = {"args": None, "options": {}, "tags": frozenset()}
+
+
+def _new_state(solver: Any, fn: _Objective, y: Any) -> Any:
+    out, loss = eqx.filter_eval_shape(fn, y, None)
+    return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
+
+
+def _arrays(state: Any) -> list[Any]:
+    return jax.tree.leaves(eqx.filter(state, eqx.is_array))
+
+
+def _state(solver: Any, fn: _Objective, y: Any, arrays: list[Any]) -> Any:
+    old, static = eqx.partition(_new_state(solver, fn, y), eqx.is_array)
+    return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), arrays), static)
+
+
+@eqx.filter_jit
+def _begin(solver, fn, y):
+    return _arrays(_new_state(solver, fn, y))
+
+
+@eqx.filter_jit
+def _step(solver, fn, y, arrays):
+    # The loss is that of the `y` that was given.
+    y, state, loss = solver.step(fn, y, state=_state(solver, fn, y, arrays), **_REST)
+    return y, _arrays(state), loss, *solver.terminate(fn, y, state=state, **_REST)
+
+
+@eqx.filter_jit
+def _finish(solver, fn, y, arrays, loss, result):
+    state = _state(solver, fn, y, arrays)
+    return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[0]
+
+
+@eqx.filter_jit
+def _loss(fn, y):
+    return fn(y, None)[1]
+
+
+def standard_errors(
+    columns: Float[Array, "residual unknown"], residual: Float[Array, "..."]
+) -> Float[Array, " unknown"]:
+    """Square roots of the diagonal of `sigma**2 (J^T J)^-1`; inf where J has a column of zeros.
+
+    As if the residuals were independent and of one variance.
+    """
+    norms = jnp.linalg.norm(columns, axis=0)
+    known = norms > 0
+    scaled = columns / jnp.where(known, norms, 1)[None]
+    eigenvalues, vectors = jnp.linalg.eigh(scaled.T @ scaled)
+    floor = jnp.finfo(columns.dtype).eps
+    variance = jnp.sum(vectors**2 / jnp.maximum(eigenvalues, floor)[None], axis=1)
+    sigma = jnp.sqrt(jnp.sum(residual**2) / max(residual.size - columns.shape[1], 1))
+    return jnp.where(known, sigma * jnp.sqrt(variance) / jnp.where(known, norms, 1), jnp.inf)
