@@ -41,11 +41,11 @@ def write_gbuffer(path: StrPath, gbuffer: GBuffer, *, camera: Camera | None = No
 
 
 def read_gbuffer(
-    path: StrPath, *, max_pixels: int = MAX_PIXELS
+    path: StrPath, *, max_pixels: int = MAX_PIXELS, verify: bool = True
 ) -> tuple[GBuffer, Camera | None]:
     """Read what `write_gbuffer` wrote; other layers in the file are let be.
 
-    **Arguments:** `path`, `max_pixels`: as for `read`.
+    **Arguments:** `path`, `max_pixels`, `verify`: as for `read`.
 
     **Returns:** the deep frame buffer; and the camera, or None where the file has none.
 
@@ -53,7 +53,7 @@ def read_gbuffer(
 
     **Gradient:** none; the host side.
     """
-    planes, header = read_planes(path, max_pixels)
+    planes, header = read_planes(path, max_pixels, verify)
     layers = assemble(path, planes)
     for name in _PASSES:
         if name not in layers:

@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import secrets
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,13 @@ _VECTORS = {"normal", "position", "direction", "tangent", "velocity", "motion", 
 _LETTERS = {"RED": "R", "GREEN": "G", "BLUE": "B", "ALPHA": "A"}
 # Rows in one chunk of a ZIP-compressed file.
 _CHUNK = 16
+# Two attributes of our own, so that no damage to a single byte makes a file look foreign; and
+# the first one as it stands in a file, before the four bytes of its value.
+_CHECKSUM, _VERSION = "jaxfx.crc32", "jaxfx.version"
+_SEAL = _CHECKSUM.encode() + b"\0int\0" + (4).to_bytes(4, "little")
 
 
-def write_whole(path: StrPath, data: bytes | memoryview) -> None:
+def write_whole(path: StrPath, data: bytes | bytearray | memoryview) -> None:
     """Write a file whole or not at all: beside the old one, then into its place."""
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
@@ -114,14 +119,43 @@ def write_planes(
     height = next(iter(planes.values())).shape[0]
     header = {
         **attributes,
+        _CHECKSUM: 0,
+        _VERSION: 1,
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        # So that `read_planes` notices a damaged height, which OpenEXR would not.
+        # So that `_size` notices a damaged height even unverified; OpenEXR would not.
         "chunkCount": -(-height // _CHUNK),
     }
     stream = io.BytesIO()
     OpenEXR.File(header, planes).write(stream)
-    write_whole(path, stream.getbuffer())
+    data = bytearray(stream.getvalue())
+    at = _value_of_seal(data)
+    data[at : at + 4] = _checksum(data, at).to_bytes(4, "little")
+    write_whole(path, data)
+
+
+def _value_of_seal(data: bytes | bytearray) -> int:
+    """Where the checksum stands in a file; -1 where it has none."""
+    start = data.find(_SEAL)
+    return start if start < 0 else start + len(_SEAL)
+
+
+def _checksum(data: bytes | bytearray, at: int) -> int:
+    """CRC-32 of a file, the four bytes of the checksum itself as zeros."""
+    view = memoryview(data)
+    return zlib.crc32(view[at + 4 :], zlib.crc32(bytes(4), zlib.crc32(view[:at])))
+
+
+def _verify(path: StrPath, data: bytes) -> None:
+    """Raise `ValueError` if `data` is a file of our own that has changed since."""
+    if _CHECKSUM.encode() not in data and _VERSION.encode() not in data:
+        return
+    at = _value_of_seal(data)
+    if at < 0 or data[at : at + 4] != _checksum(data, at).to_bytes(4, "little"):
+        raise ValueError(
+            f"`{path}` is damaged: its checksum does not fit. If another program has rewritten "
+            "it, `verify=False` reads it."
+        )
 
 
 def write(path: StrPath, channels: Mapping[str, Any] | ArrayLike) -> None:
@@ -184,13 +218,17 @@ def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[in
     return height, width
 
 
-def read_planes(path: StrPath, max_pixels: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_planes(
+    path: StrPath, max_pixels: int, verify: bool
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Every channel of a file by its full name, and the header of its first part."""
     with open(path, "rb") as file:
         magic = file.read(4)
-    if magic != b"v/1\x01":
-        found = f"got one that begins with {magic!r}" if magic else "got an empty one"
-        raise ValueError(f"`{path}` must be an OpenEXR file, {found}.")
+        if magic != b"v/1\x01":
+            found = f"got one that begins with {magic!r}" if magic else "got an empty one"
+            raise ValueError(f"`{path}` must be an OpenEXR file, {found}.")
+        if verify:
+            _verify(path, magic + file.read())
     headers = [part.header for part in _open(path, header_only=True)]
     sizes = [_size(path, header, max_pixels) for header in headers]
     parts = _open(path, header_only=False)
@@ -237,7 +275,9 @@ def assemble(path: StrPath, planes: Mapping[str, np.ndarray]) -> dict[str, np.nd
     return layers
 
 
-def read(path: StrPath, *, max_pixels: int = MAX_PIXELS) -> dict[str, np.ndarray]:
+def read(
+    path: StrPath, *, max_pixels: int = MAX_PIXELS, verify: bool = True
+) -> dict[str, np.ndarray]:
     """Read an EXR file: what `write` wrote, to the bit, under the same keys.
 
     Files of other programs are read too, of one part or several, in scan lines or tiles; an
@@ -249,13 +289,16 @@ def read(path: StrPath, *, max_pixels: int = MAX_PIXELS) -> dict[str, np.ndarray
     - `path`: the file.
     - `max_pixels`: the largest width times height to accept, 2**28 by default, so that a
       damaged header can't ask for all memory.
+    - `verify`: whether a file of `write`'s must fit its checksum. One that another program has
+      rewritten, header and all, does not fit it any more; False reads it all the same.
 
     **Returns:** arrays by name, height width or height width channel.
 
     **Raises:** `ValueError` that names the file where it is damaged, not EXR, deep, subsampled
-    or too large: all channels come back, or none. `OSError` where it can't be opened. Since
-    EXR has no checksum, damage that happens to make another valid file goes unnoticed.
+    or too large: all channels come back, or none. `OSError` where it can't be opened. EXR has
+    no checksum, so `write` puts one into the header: any bit that flips in its files is
+    noticed. In a file of another program, damage that makes another valid file is not.
 
     **Gradient:** none; the host side.
     """
-    return assemble(path, read_planes(path, max_pixels)[0])
+    return assemble(path, read_planes(path, max_pixels, verify)[0])

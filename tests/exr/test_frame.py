@@ -128,7 +128,54 @@ def test_a_damaged_camera(tmp_path, old, new, message):
     data = path.read_bytes()
     assert old in data
     path.write_bytes(data.replace(old, new))
+    with pytest.raises(ValueError, match=r"a.exr` is damaged: its checksum does not fit"):
+        exr.read_gbuffer(path)
     with pytest.raises(ValueError, match=rf"a.exr` must hold a deep frame buffer: .*{message}"):
+        exr.read_gbuffer(path, verify=False)
+
+
+def test_the_passes_of_another_program(tmp_path):
+    """Without our attributes there is no checksum to fit, and no camera."""
+    before = gbuffer()
+    exr.write_gbuffer(tmp_path / "a.exr", before)
+    planes = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    pixels = {name: channel.pixels for name, channel in planes.items()}
+    OpenEXR.File(header, pixels).write(str(tmp_path / "b.exr"))
+    after, none = exr.read_gbuffer(tmp_path / "b.exr")
+    assert none is None
+    assert eqx.tree_equal(before, after, typematch=True)
+
+
+@pytest.mark.parametrize("value", [0x01, 0x80, 0xFF])
+def test_no_byte_can_change_unnoticed(tmp_path, value):
+    """Every byte of the header and of the table of chunks, and a share of the chunks'."""
+    path = tmp_path / "a.exr"
+    exr.write_gbuffer(path, gbuffer(height=40), camera=camera(PinholeCamera, np.float32))
+    data = bytearray(path.read_bytes())
+    # A zero ends the header; eight bytes follow for each of three chunks.
+    chunks = data.index(b"scanlineimage") + 14 + 24
+    assert data[chunks : chunks + 4] == bytes(4)  # the first chunk's first row
+    for at in [*range(chunks), *range(chunks, len(data), 37), len(data) - 1]:
+        data[at] ^= value
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"a\.exr` (must be an OpenEXR file|is damaged: )"):
+            exr.read_gbuffer(path)
+        data[at] ^= value
+    path.write_bytes(data)
+    exr.read_gbuffer(path)
+
+
+def test_no_cut_goes_unnoticed(tmp_path):
+    path = tmp_path / "a.exr"
+    exr.write_gbuffer(path, gbuffer(), camera=camera(PinholeCamera, np.float32))
+    data = path.read_bytes()
+    for end in range(len(data)):
+        path.write_bytes(data[:end])
+        with pytest.raises(ValueError, match=r"a\.exr` (must be an OpenEXR file|is damaged: )"):
+            exr.read_gbuffer(path)
+    path.write_bytes(data + b"\0")
+    with pytest.raises(ValueError, match=r"a\.exr` is damaged: "):
         exr.read_gbuffer(path)
 
 
