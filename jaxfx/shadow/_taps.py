@@ -1,0 +1,177 @@
+"""What every filter shares: the map as texels to read, the receivers as places to read them.
+
+A texel outside the map is as far as can be, so that all is lit that is compared with it. A
+receiver that is lit whatever the map says reads such texels only. Then no filter has a case to
+tell apart: it reads `texels[place.texel + offset]` and compares with `place.threshold`.
+"""
+
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfx._numerics import absolute, check, parameter, working_dtype
+from jaxfx.shadow.receivers import Receivers
+
+
+Kernel = Literal["box", "tent", "gaussian"]
+
+# Filters of up to so many rows are written out; larger ones loop over rows to compile sooner.
+_UNROLLED = 9
+
+
+class Places(NamedTuple):
+    """Receivers as places in the padded map, an array of any one shape.
+
+    `texel` is the one that holds the receiver, `dx` and `dy` lead from its centre to the
+    receiver, in texels; what is nearer to the light than `threshold` shadows it.
+    """
+
+    texel: Int[Array, "*place"]
+    threshold: Float[Array, "*place"]
+    dx: Float[Array, "*place"]
+    dy: Float[Array, "*place"]
+
+
+class Texels(NamedTuple):
+    """A padded map, row after row, and the length of a row."""
+
+    flat: Float[Array, " texel"]
+    stride: int
+
+
+def check_size(function: str, size: Any) -> int:
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1 or size % 2 == 0:
+        raise ValueError(
+            f"`{function}(size=...)` must be an odd number of texels from 1, got {size!r}."
+        )
+    return size
+
+
+def check_kernel(function: str, kernel: str) -> None:
+    if kernel not in get_args(Kernel):
+        raise ValueError(
+            f"`{function}(kernel=...)` must be one of {get_args(Kernel)}, got {kernel!r}."
+        )
+
+
+def check_softness(function: str, softness: Any) -> Array | None:
+    if softness is None:
+        return None
+    softness = parameter(f"{function}(softness=...)", softness)
+    check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
+    return softness
+
+
+def check_data(function: str, shadow_map: Any, receivers: Any) -> tuple[Array, Receivers]:
+    shadow_map = jnp.asarray(shadow_map)
+    if shadow_map.ndim != 2 or 0 in shadow_map.shape:
+        raise ValueError(
+            f"`{function}(shadow_map)` must have shape (height, width), neither of them 0, "
+            f"got {shadow_map.shape}. Batches are made with `jax.vmap`."
+        )
+    fields = [jnp.asarray(field) for field in receivers]
+    for name, field in zip(Receivers._fields, fields, strict=True):
+        if field.shape != fields[0].shape or field.ndim != 2 or 0 in field.shape:
+            raise ValueError(
+                f"`{function}(receivers)` must hold images of one shape (height, width), "
+                f"got {field.shape} for `{name}`."
+            )
+    for name, field in (("shadow_map", shadow_map), ("receivers", fields[0])):
+        if not jnp.issubdtype(field.dtype, jnp.floating):
+            raise ValueError(f"`{function}({name})` must hold floats, got {field.dtype}.")
+    return shadow_map, Receivers(*fields)
+
+
+def check_bias(function: str, bias: Any, slope_bias: Any) -> tuple[Array, Array]:
+    bias = parameter(f"{function}(bias=...)", bias)
+    slope_bias = parameter(f"{function}(slope_bias=...)", slope_bias)
+    return bias, slope_bias
+
+
+def common_dtype(shadow_map: Array, receivers: Receivers) -> jnp.dtype:
+    return working_dtype(shadow_map.dtype, *(field.dtype for field in receivers))
+
+
+def pad_map(shadow_map: Float[Array, "rows columns"], size: int, dtype: Any) -> Texels:
+    """The map with `size` texels that are infinitely far all around; NaN is infinitely far."""
+    known = jnp.where(jnp.isnan(shadow_map), jnp.inf, shadow_map).astype(dtype)
+    padded = jnp.pad(known, size, constant_values=jnp.inf)
+    return Texels(padded.reshape(-1), padded.shape[1])
+
+
+def find_places(
+    receivers: Receivers,
+    bias: Float[Array, ""],
+    slope_bias: Float[Array, ""],
+    shape: tuple[int, int],
+    size: int,
+    dtype: Any,
+) -> Places:
+    """The receivers in a map of `shape` that `pad_map` padded for filters of `size`."""
+    u, v, z, slope = (field.astype(dtype) for field in receivers)
+    threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
+    # Computed once: the mask and the filter must agree on it to the last bit.
+    threshold = jax.lax.optimization_barrier(threshold)
+    known = jnp.isfinite(u) & jnp.isfinite(v) & jnp.isfinite(threshold) & (z > 0)
+    u, v = jnp.where(known, u, -size), jnp.where(known, v, -size)
+    threshold = jnp.where(known, threshold, 0)
+
+    x, y = (jax.lax.stop_gradient(jnp.floor(each)) for each in (u, v))
+    reach = size // 2
+    column, row = (
+        (jnp.clip(each, -reach - 1, count + reach) + size).astype(jnp.int32)
+        for each, count in ((x, shape[1]), (y, shape[0]))
+    )
+    texel = row * (shape[1] + 2 * size) + column
+    return Places(texel, threshold, u - x - 0.5, v - y - 0.5)
+
+
+def lit(
+    texel: Float[Array, "*place"],
+    threshold: Float[Array, "*place"],
+    softness: Float[Array, ""] | None,
+) -> Float[Array, "*place"]:
+    """1 where the texel does not shadow, 0 where it does; between the two within `softness`."""
+    if softness is None:
+        return (texel >= threshold).astype(threshold.dtype)
+    half = half_width(softness, threshold.dtype)
+    along = (jnp.clip(texel - threshold, -half, half) / half + 1) / 2
+    return along * along * (3 - 2 * along)
+
+
+def half_width(softness: Float[Array, ""], dtype: Any) -> Float[Array, ""]:
+    return jnp.maximum(softness.astype(dtype) / 2, jnp.finfo(dtype).tiny * 1e4)
+
+
+def weight(offset: Float[Array, "*place"], size: int, kernel: Kernel) -> Float[Array, "*place"]:
+    """A tap's weight along one axis, by its centre's distance from the receiver in texels.
+
+    Tent and Gaussian (sigma a sixth of `size`) fall to 0 where the next tap takes over, so that
+    they are continuous as the receiver moves.
+    """
+    half = size / 2
+    if kernel == "box":
+        return jnp.ones_like(offset)
+    if kernel == "tent":
+        return jnp.maximum(half - absolute(offset), 0)
+    edge = jnp.exp(jnp.asarray(-4.5, offset.dtype))
+    return jnp.maximum(jnp.exp(-0.5 * (offset * (3 / half)) ** 2) - edge, 0)
+
+
+def taps(size: int) -> range:
+    return range(-(size // 2), size // 2 + 1)
+
+
+def sum_rows(row, size: int) -> Any:
+    """The sum of `row(dy)` over the filter's rows; `dy` is a Python or a traced integer."""
+    if size <= _UNROLLED:
+        first, *others = map(row, taps(size))
+        for other in others:
+            first = jax.tree.map(jnp.add, first, other)
+        return first
+    zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(row, jnp.asarray(0, jnp.int32)))
+    zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), zero)
+    step = jax.checkpoint(lambda total, dy: (jax.tree.map(jnp.add, total, row(dy)), None))
+    return jax.lax.scan(step, zero, jnp.asarray(taps(size), jnp.int32))[0]

@@ -1,0 +1,188 @@
+"""Shadow-map comparison: alone, after filtering, and before it (percentage closer)."""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx.shadow import _taps
+from jaxfx.shadow._taps import Kernel, Places, Texels
+from jaxfx.shadow.receivers import Receivers
+
+
+def hard(
+    shadow_map: Float[ArrayLike, "rows columns"],
+    receivers: Receivers,
+    *,
+    bias: Float[ArrayLike, ""] | float = 0.0,
+    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+) -> Float[Array, "height width"]:
+    """Visibility by the comparison alone: 0 or 1, with aliased edges.
+
+    A receiver is in shadow where the texel that holds it is nearer to the light than
+    `z - bias - slope_bias * slope`, and lit otherwise: at equality, outside the map, behind
+    the light, and where the texel is inf or not a number.
+
+    **Arguments:**
+
+    - `shadow_map`: rows columns, depth from the light in scene units, inf where there is
+      nothing.
+    - `receivers`: what `receivers` returned, height width.
+    - `bias`: scene units by which a texel must be nearer to shadow.
+    - `slope_bias`: pixels of the map by which the same grows where light grazes: so many times
+      the change of depth from one to the next. Half a filter's size keeps a plane lit.
+
+    **Returns:** height width, 0 or 1, in the type of the receivers.
+
+    **Raises:** `ValueError` for a wrong shape or an integer map.
+
+    **Gradient:** zero, for the comparison is a step: use `pcf` with `softness`.
+
+    Source: Williams 1978, section 3.
+    """
+    shadow_map, receivers = _taps.check_data("hard", shadow_map, receivers)
+    biases = _taps.check_bias("hard", bias, slope_bias)
+    return jax.lax.stop_gradient(_pcf(shadow_map, receivers, *biases, None, 1, "box"))
+
+
+def prefiltered(
+    shadow_map: Float[ArrayLike, "rows columns"],
+    receivers: Receivers,
+    *,
+    size: int,
+    bias: Float[ArrayLike, ""] | float = 0.0,
+    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+) -> Float[Array, "height width"]:
+    """Visibility by comparing with the mean depth of `size` x `size` texels: the wrong order.
+
+    It is still 0 or 1, and the mean of an occluder's depth and its background's is that of
+    neither. Kept to show so. A filter that reaches an inf or past the map's edge is lit.
+
+    **Arguments:**
+
+    - `shadow_map`, `receivers`: height width, as in `hard`.
+    - `size`: static; odd, in texels.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`.
+
+    **Returns:** height width, 0 or 1, in the type of the receivers.
+
+    **Raises:** `ValueError` for a wrong shape, an integer map or an even size.
+
+    **Gradient:** zero, as `hard`'s.
+
+    Source: the order of filtering that Reeves, Salesin & Cook 1987, section 3, warn of.
+    """
+    shadow_map, receivers = _taps.check_data("prefiltered", shadow_map, receivers)
+    size = _taps.check_size("prefiltered", size)
+    biases = _taps.check_bias("prefiltered", bias, slope_bias)
+    return jax.lax.stop_gradient(_prefiltered(shadow_map, receivers, *biases, size))
+
+
+@ft.partial(jax.jit, static_argnames=("size",))
+def _prefiltered(shadow_map, receivers, bias, slope_bias, size):
+    dtype = _taps.common_dtype(shadow_map, receivers)
+    texels = _taps.pad_map(shadow_map, size, dtype)
+    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
+
+    def row(dy):
+        start = places.texel + dy * texels.stride
+        return sum(_read(texels, start + dx) for dx in _taps.taps(size))
+
+    mean = _taps.sum_rows(row, size) / size**2
+    return _taps.lit(mean, places.threshold, None).astype(receivers.z.dtype)
+
+
+def pcf(
+    shadow_map: Float[ArrayLike, "rows columns"],
+    receivers: Receivers,
+    *,
+    size: int,
+    bias: Float[ArrayLike, ""] | float = 0.0,
+    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    softness: Float[ArrayLike, ""] | float | None = None,
+    kernel: Kernel = "box",
+) -> Float[Array, "height width"]:
+    """Percentage-closer filtering: the share of `size` x `size` texels that do not shadow.
+
+    The filter lies about the texel that holds the receiver. Each texel is compared as in
+    `hard`, then the comparisons are averaged.
+
+    **Arguments:**
+
+    - `shadow_map`, `receivers`: height width, as in `hard`.
+    - `size`: static; odd, in texels.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`.
+    - `softness`: scene units; the comparison goes from 0 to 1 by a smoothstep this wide, half
+      on each side of the bias. Left out, it is a step, to which it tends.
+    - `kernel`: the weights: `"box"`, all the same, wherever in its texel the receiver is; or
+      `"tent"` and `"gaussian"`, centred on the receiver, so that visibility is continuous as
+      it moves.
+
+    **Returns:** height width, in [0, 1], in the type of the receivers.
+
+    **Raises:** `ValueError` for a wrong shape, an integer map, an even size, a softness that is
+    not positive or an unknown kernel.
+
+    **Gradient:** exact, forward and reverse, with respect to every float, and so to the depth,
+    the cameras and the biases behind `receivers`. Of the comparison without `softness`, and of
+    the position with the box, it is zero almost everywhere; what a picture loses by their
+    jumps is missing. The map is data: that an occluder moves with the light is missing too.
+
+    Source: Reeves, Salesin & Cook 1987, section 3; our own: the smooth comparison and the
+    weights that follow the receiver.
+    """
+    shadow_map, receivers = _taps.check_data("pcf", shadow_map, receivers)
+    size = _taps.check_size("pcf", size)
+    _taps.check_kernel("pcf", kernel)
+    softness = _taps.check_softness("pcf", softness)
+    biases = _taps.check_bias("pcf", bias, slope_bias)
+    return _pcf(shadow_map, receivers, *biases, softness, size, kernel)
+
+
+@ft.partial(jax.jit, static_argnames=("size", "kernel"))
+def _pcf(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
+    dtype = _taps.common_dtype(shadow_map, receivers)
+    texels = _taps.pad_map(shadow_map, size, dtype)
+    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
+    return average(texels, places, softness, size, kernel).astype(receivers.z.dtype)
+
+
+def average(
+    texels: Texels,
+    places: Places,
+    softness: Float[Array, ""] | None,
+    size: int,
+    kernel: Kernel,
+) -> Float[Array, "*place"]:
+    """The mean comparison of the taps about each place."""
+
+    def compared(index):
+        return _taps.lit(_read(texels, index), places.threshold, softness)
+
+    if kernel == "box" or size == 1:
+
+        def count(dy):
+            start = places.texel + dy * texels.stride
+            return sum(compared(start + dx) for dx in _taps.taps(size))
+
+        return _taps.sum_rows(count, size) / size**2
+
+    across = [_taps.weight(dx - places.dx, size, kernel) for dx in _taps.taps(size)]
+
+    def row(dy):
+        start = places.texel + dy * texels.stride
+        weighted = sum(
+            w * compared(start + dx) for w, dx in zip(across, _taps.taps(size), strict=True)
+        )
+        down = jnp.asarray(dy).astype(places.dy.dtype) - places.dy
+        weight = _taps.weight(down, size, kernel)
+        return weight * weighted, weight
+
+    total, down = _taps.sum_rows(row, size)
+    return total / (down * sum(across))
+
+
+def _read(texels: Texels, index) -> Array:
+    return texels.flat.at[index].get(mode="promise_in_bounds")
