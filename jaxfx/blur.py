@@ -1,0 +1,370 @@
+"""Gaussian and binomial filters, separable, with discrete or with linear sampling."""
+
+import functools as ft
+import math
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import check, check_image, parameter, working_dtype
+
+
+__all__ = ["binomial_weights", "downsample", "gaussian", "linear_taps"]
+
+Sampling = Literal["discrete", "linear"]
+
+# A variance below this, in pixels squared, is this: no neighbour's weight exceeds e**-500.
+_SMALLEST_VARIANCE = 1e-3
+
+
+def gaussian(
+    image: Float[ArrayLike, "height width channel"],
+    *,
+    taps: int = 9,
+    passes: int = 1,
+    sampling: Sampling = "discrete",
+    sigma: Float[ArrayLike, ""] | float | None = None,
+    row: int | None = None,
+) -> Float[Array, "height width channel"]:
+    """Gaussian blur: `taps` along the columns, then along the rows, `passes` times over.
+
+    A pixel becomes the mean of its neighbours, weighted by w_i w_j at an offset of (i, j)
+    pixels; beyond the border the nearest pixel is repeated. The weights are binomial ones, or
+    those of `exp(-i**2 / (2 sigma**2))`, and sum to 1. Variances add: n passes of k taps reach
+    as far as one of n (k - 1) + 1 taps, for n k reads along each axis.
+
+    **Arguments:**
+
+    - `image`: height width channel, any unit; linear radiance is what light adds up in.
+    - `taps`: static; how many pixels one pass reads along an axis, odd.
+    - `passes`: static; how often the pair of passes is done.
+    - `sampling`: "discrete", a tap a read; or "linear", two neighbouring taps as one read in
+      between, as `linear_taps` places it: equal to rounding. For texture units; XLA has none,
+      and reads the same pixels for it.
+    - `sigma`: pixels, the standard deviation of the whole blur, all passes together; 0 is the
+      identity. Weights beyond the taps are dropped: from some `sigma = sqrt(passes) * taps / 5`
+      on the blur is weaker than asked for, and it tends to that of equal weights,
+      `sqrt(passes * (taps**2 - 1) / 12)` pixels. Below 0.6 pixels a pass, too, it is weaker:
+      there is little between a pixel and the next.
+    - `row`: static; without `sigma`, the row of Pascal's triangle, of even index. By default
+      `taps + 3`: the outer two on either side dropped, 66, 220, 495, 792, 924, ... for 9 taps.
+
+    **Returns:** height width channel, in the type of `image`. A pixel that is not finite spoils
+    what the taps of all passes can reach, `passes * (taps // 2)` pixels along either axis.
+
+    **Raises:** `ValueError` for a wrong shape, an integer image, an even or non-positive
+    `taps`, `passes` below 1, a negative `sigma`, a `row` too short, `sigma` and `row` together,
+    or an unknown `sampling`.
+
+    **Gradient:** exact with respect to `image` and `sigma`; at `sigma` 0 it is 0 in `sigma`,
+    which is the limit.
+
+    Source: the product of two one-dimensional Gaussians; weights from binomial coefficients and
+    linear sampling after Rakos 2010, efficient Gaussian blur with linear sampling.
+    """
+    image = check_image("gaussian(image)", image)
+    if not isinstance(taps, int) or taps < 1 or taps % 2 == 0:
+        raise ValueError(
+            f"`gaussian(taps=...)` must be an odd positive integer, got {taps}. An even kernel "
+            "lies between pixels: `downsample` has it."
+        )
+    if not isinstance(passes, int) or passes < 1:
+        raise ValueError(f"`gaussian(passes=...)` must be a positive integer, got {passes}.")
+    if sampling not in get_args(Sampling):
+        raise ValueError(
+            f"`gaussian(sampling=...)` must be one of {get_args(Sampling)}, got {sampling!r}."
+        )
+    if sigma is None:
+        weights = _binomial("gaussian", taps, taps + 3 if row is None else row)
+    elif row is None:
+        sigma = parameter("gaussian(sigma=...)", sigma)
+        check("gaussian(sigma=...)", sigma, lambda v: v >= 0, "0 or positive")
+        weights = _gaussian_weights(taps, sigma, passes)
+    else:
+        raise ValueError(
+            f"`gaussian(row=...)` must be left out where `sigma` is given, got {row}."
+        )
+    return _blur(image, jnp.asarray(weights), passes, sampling)
+
+
+def binomial_weights(taps: int, *, row: int) -> Float[Array, "taps"]:
+    """The middle of a row of Pascal's triangle, divided by its own sum.
+
+    Divided by the whole row's sum, 2 to the power of `row`, instead, what is dropped would
+    darken the image with every pass: by 4070 / 4096 along each axis for 9 taps of row 12.
+
+    **Arguments:**
+
+    - `taps`: how many weights, an integer; `row + 1` is the whole row.
+    - `row`: index of the row, from 0, an integer; the taps must lie in its middle, so that one
+      of `row` and `taps` is even.
+
+    **Returns:** `taps` weights, symmetric, of sum 1, in the default float type.
+
+    **Raises:** `ValueError` for a `taps` that is not positive, a row that is too short or whose
+    middle lies between taps.
+
+    **Gradient:** none; the arguments are integers.
+
+    Source: Rakos 2010, efficient Gaussian blur with linear sampling; the normal distribution's
+    discrete kin is the binomial one.
+    """
+    return jnp.asarray(_binomial("binomial_weights", taps, row))
+
+
+def linear_taps(
+    weights: Float[ArrayLike, "taps"],
+) -> tuple[Float[Array, "reads"], Float[Array, "reads"]]:
+    """Half as many reads between the pixels, by linear interpolation, for the same sum.
+
+    Two neighbours with weights a and b, at o and o + 1, are one read at `o + b / (a + b)` with
+    weight a + b. Pairs are taken outwards from the middle, so that a symmetric kernel stays
+    symmetric: where the middle tap of an odd kernel would leave one over, it is halved between
+    both sides. So n taps take (n + 1) // 2 reads.
+
+    **Arguments:** `weights`: of the taps, one pixel apart, none negative. The middle is at
+    offset 0: on a pixel for an odd number of taps, between two pixels for an even one.
+
+    **Returns:** `offsets`, in pixels from the middle, ascending, and `weights`, one a read. A
+    pair of weight 0, or below 3e-10 in float32 and 1e-77 in float64, is read at its first
+    pixel.
+
+    **Raises:** `ValueError` for weights that are not a vector of floats, or where one is
+    negative.
+
+    **Gradient:** exact; zero in the offset of a pair of weight 0 or next to it.
+
+    Source: Rakos 2010, efficient Gaussian blur with linear sampling; the halved middle is ours.
+    """
+    array = jnp.asarray(weights)
+    if array.ndim != 1 or not array.size or not jnp.issubdtype(array.dtype, jnp.floating):
+        raise ValueError(
+            "`linear_taps(weights)` must be a vector of floats, "
+            f"got {array.dtype} of shape {array.shape}."
+        )
+    check("linear_taps(weights)", array, lambda v: v >= 0, "0 or positive")
+    reads = _reads(array)
+    middle = (array.size - 1) / 2
+    offsets = jnp.stack([first - middle + share for first, share, _ in reads])
+    return offsets, jnp.stack([weight for _, _, weight in reads])
+
+
+def downsample(
+    image: Float[ArrayLike, "height width channel"], *, taps: int = 2
+) -> Float[Array, "half_height half_width channel"]:
+    """The image at half its height and width, filtered by an even binomial kernel.
+
+    A pixel of the result lies between pixels 2 i and 2 i + 1 of the image, where the middle of
+    an even kernel is; beyond the border the nearest pixel is repeated.
+
+    **Arguments:**
+
+    - `image`: height width channel, any unit.
+    - `taps`: static; pixels along an axis, even: 2 is the mean of 2 by 2 pixels, 4 has the
+      weights 1, 3, 3, 1, and so on along Pascal's triangle.
+
+    **Returns:** height / 2, width / 2, rounded up, and channel, in the type of `image`. A pixel
+    that is not finite spoils what its taps reach.
+
+    **Raises:** `ValueError` for a wrong shape, an integer image, or a `taps` that is not even
+    and positive.
+
+    **Gradient:** exact.
+
+    Source: the even rows of the binomial kernel, which Rakos 2010 names for a half-size image;
+    Burt 1981 has them as generating kernels of pyramids.
+    """
+    image = check_image("downsample(image)", image)
+    if not isinstance(taps, int) or taps < 2 or taps % 2:
+        raise ValueError(f"`downsample(taps=...)` must be even and positive, got {taps}.")
+    weights = jnp.asarray(_binomial("downsample", taps, taps - 1))
+    return _downsample(image, weights)
+
+
+def _binomial(function: str, taps: int, row: int) -> Float[np.ndarray, "taps"]:
+    """The middle `taps` of a row of Pascal's triangle, of sum 1."""
+    if not isinstance(taps, int) or taps < 1:
+        raise ValueError(f"`{function}(taps=...)` must be a positive integer, got {taps}.")
+    dropped = row + 1 - taps if isinstance(row, int) else -1
+    if dropped < 0 or dropped % 2:
+        raise ValueError(
+            f"`{function}(row=...)` must be {taps - 1}, {taps + 1}, {taps + 3} ..., so that "
+            f"{taps} taps lie in its middle, got {row}."
+        )
+    kept = [math.comb(row, i) for i in range(dropped // 2, dropped // 2 + taps)]
+    return np.array([weight / sum(kept) for weight in kept])
+
+
+def _gaussian_weights(taps: int, sigma: Float[Array, ""], passes: int) -> Float[Array, "taps"]:
+    """The weights of one pass, of which all passes have the standard deviation `sigma`."""
+    distance = jnp.arange(taps, dtype=sigma.dtype) - taps // 2
+    variance = jnp.maximum(sigma * sigma / passes, _SMALLEST_VARIANCE)
+    weights = jnp.exp(-distance * distance / (2 * variance))
+    return weights / jnp.sum(weights)
+
+
+def _reads(weights: Float[Array, "taps"]) -> list[tuple[int, Array, Array]]:
+    """What linear sampling reads: the first tap, the second's share, and the weight of both.
+
+    The first tap is static. A read of one tap alone has a share of 0.
+    """
+    taps = weights.size
+    half = taps // 2
+    lone = (taps + half) % 2  # whether the middle is a read of its own
+    right = [(i, i + 1) for i in range(half + lone, taps, 2)]
+    left = [(taps - 1 - j, taps - 1 - i) for i, j in reversed(right)]
+    if taps % 2 and not lone:
+        weights = weights.at[half].divide(2)
+    # Below this a share changes no sum, and its derivatives would overflow.
+    least = jnp.finfo(weights.dtype).tiny ** 0.25
+    reads = []
+    for i, j in left + [(taps - 1 - half, half)] * lone + right:
+        if i == j:
+            reads.append((i, jnp.zeros_like(weights[i]), weights[i]))
+        else:
+            total = weights[i] + weights[j]
+            is_seen = total > least
+            share = jnp.where(is_seen, weights[j] / jnp.where(is_seen, total, 1), 0)
+            reads.append((i, share, total))
+    return reads
+
+
+# A pass is a sum over taps, the arrays that `tap(i)` gives; they differ in their offset only.
+Tap = Callable[[int], Array]
+
+
+def _discrete(weights: Float[Array, "taps"], tap: Tap) -> Array:
+    """The weighted sum of symmetric taps: two that share a weight are added first."""
+    last = weights.size - 1
+    pairs = [weights[i] * (tap(i) + tap(last - i)) for i in range(weights.size // 2)]
+    middle = [weights[last // 2] * tap(last // 2)] if weights.size % 2 else []
+    return ft.reduce(jnp.add, middle + pairs)
+
+
+def _linear(weights: Float[Array, "taps"], tap: Tap) -> Array:
+    """The same sum by half as many reads, each interpolated between two taps."""
+
+    def read(i: int, share: Array, is_lone: bool) -> Array:
+        return tap(i) if is_lone else tap(i) + share * (tap(i + 1) - tap(i))
+
+    middle = weights.size // 2 if weights.size % 4 == 1 else -1
+    return ft.reduce(
+        jnp.add,
+        [weight * read(i, share, i == middle) for i, share, weight in _reads(weights)],
+    )
+
+
+_SUMS = {"discrete": _discrete, "linear": _linear}
+
+
+@ft.partial(jax.jit, static_argnames=("passes", "sampling"))
+def _blur(image, weights, passes, sampling):
+    dtype = image.dtype
+    image = image.astype(working_dtype(dtype))
+    weights = weights.astype(image.dtype)
+    return lax.fori_loop(
+        0, passes, lambda _, image: _pass(sampling, image, weights), image
+    ).astype(dtype)
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _pass(
+    sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
+) -> Float[Array, "h w c"]:
+    """One pass down the columns and one along the rows."""
+    if weights.size == 1 or image.shape[1] < weights.size:
+        return _padded(sampling, image, weights)
+    return _unpadded(sampling, image, weights)
+
+
+@_pass.defjvp
+def _(sampling, primals, tangents):
+    # Both samplings are the same sum.
+    _, dot = jax.jvp(ft.partial(_padded, "discrete"), primals, tangents)
+    return _pass(sampling, *primals), dot
+
+
+def _padded(
+    sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
+) -> Float[Array, "h w c"]:
+    """By copies with a margin: for small images, and for JAX to differentiate."""
+    height, width, channels = image.shape
+    total, half = ft.partial(_SUMS[sampling], weights), weights.size // 2
+    margin = ((half, half), (half, half), (0, 0))
+    wide = jnp.pad(image, margin, mode="edge").reshape(height + 2 * half, -1)
+    columns = total(lambda i: lax.slice_in_dim(wide, i, i + height))
+    row = width * channels
+    return total(
+        lambda i: lax.slice_in_dim(columns, i * channels, i * channels + row, axis=1)
+    ).reshape(image.shape)
+
+
+def _unpadded(
+    sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
+) -> Float[Array, "h w c"]:
+    """Without a copy of the image: it is read twice and written twice.
+
+    Down the columns, rows are named by their index, clamped to the image. Along the rows, a tap
+    is the flat image moved by some pixels, which runs on into the next row at either border:
+    there the result is computed apart, in two strips, and put in its place.
+    """
+    height, width, channels = image.shape
+    total, half = ft.partial(_SUMS[sampling], weights), weights.size // 2
+    row, reach = width * channels, half * channels
+
+    flat = image.reshape(height, row)
+    indices = np.arange(height)[:, None] + np.arange(-half, half + 1)
+    indices = jnp.asarray(indices.clip(0, height - 1))
+    columns = total(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
+    # A row of zeros about it, for the flat image's ends. XLA keeps what is padded in memory,
+    # where it would compute the sum anew for every tap that reads it.
+    zero = jnp.zeros((), image.dtype)
+    columns = lax.pad(columns, zero, ((1, 1, 0), (0, 0, 0))).reshape(-1)
+
+    def moved(i: int) -> Array:
+        start = row - reach + i * channels
+        return lax.slice_in_dim(columns, start, start + height * row)
+
+    result = total(moved).reshape(height, row)
+    strips = [
+        _padded(sampling, side, weights)
+        for side in (image[:, : 2 * half], image[:, -2 * half :])
+    ]
+    left, right = (strip.reshape(height, -1) for strip in strips)
+    strips = jnp.stack([left[:, :reach], right[:, -reach:]])
+
+    # In a loop: outside of one, XLA computes the whole result again to put a strip into it.
+    def put(i: Array, result: Array) -> Array:
+        return lax.dynamic_update_slice_in_dim(result, strips[i], i * (row - reach), axis=1)
+
+    return lax.fori_loop(0, 2, put, result).reshape(image.shape)
+
+
+@jax.jit
+def _downsample(image, weights):
+    dtype = image.dtype
+    image = image.astype(working_dtype(dtype))
+    weights = weights.astype(image.dtype)
+    return _halved(_halved(image, weights, 0), weights, 1).astype(dtype)
+
+
+def _halved(
+    image: Float[Array, "h w c"], weights: Float[Array, "taps"], axis: int
+) -> Float[Array, "H W c"]:
+    """Every second pixel along an axis, of those between the image's."""
+    size, half = image.shape[axis], weights.size // 2 - 1
+    margin = [(0, 0)] * 3
+    margin[axis] = (half, half + size % 2)
+    wide = jnp.pad(image, margin, mode="edge")
+    length = wide.shape[axis] - 2 * half
+
+    def tap(i: int) -> Array:
+        return lax.slice_in_dim(wide, i, i + length - 1, 2, axis)
+
+    return _discrete(weights, tap)
