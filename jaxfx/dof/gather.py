@@ -1,0 +1,131 @@
+"""Depth of field by a few taps a pixel, some of them from a low-resolution picture."""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import check, clip01, parameter
+from jaxfx._sampling import bilinear, pixel_centers
+from jaxfx.dof._discs import POISSON, vogel
+from jaxfx.dof._inputs import check_arguments, check_count, defocused
+from jaxfx.lens import FocusPlanes, ThinLens
+
+
+# The side of a low-resolution pixel, and the disc's radius in those pixels (Scheuermann 2004).
+_SIDE = 4
+_LOW_RADIUS = 0.4
+
+
+def gather(
+    image: Float[ArrayLike, "height width channel"],
+    depth: Float[ArrayLike, "height width"],
+    lens: ThinLens | FocusPlanes,
+    *,
+    max_coc: int | float | None = None,
+    taps: int | None = None,
+    softness: Float[ArrayLike, ""] | float = 1.0,
+) -> Float[Array, "height width channel"]:
+    """Depth of field by taps on the pixel's own circle of confusion, with a test of leaks.
+
+    With the signed defocus D, the circle of confusion C and the blurriness b = C / `max_coc`,
+    the result at q is the mean of the taps `q + disc[i] * C_q / 2`, each
+
+    - mixed from the picture and a low-resolution one (a quarter of the width and the height,
+      blurred by a 3x3 Gaussian, read at 0.4 of the radius in its own pixels) by the tap's b;
+    - weighted by 1 if the tap lies behind q, and by its own b if it lies in front: what is in
+      focus does not leak onto what is behind it.
+
+    A pixel gathers over its own circle, not over those that reach it: a blurred foreground
+    keeps a hard rim before a background in focus. Eight taps are too few beyond some 10 pixels.
+
+    **Arguments:**
+
+    - `image`: height width channel, linear radiance.
+    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `lens`: gives each depth its signed defocus, in pixels.
+    - `max_coc`: static; the largest diameter, in pixels, to which larger ones are clamped, and
+      that of a pixel whose b is 1. Outside `jit`, `grad` and `vmap` it may be left out.
+    - `taps`: how many, on a Vogel spiral; None for the paper's eight Poisson points.
+    - `softness`: pixels of defocus over which a tap turns from behind into in front. 0 is the
+      paper's own step, `D_tap >= D_q`.
+
+    **Returns:** height width channel, in the type of `image`. A pixel that is not a number
+    spoils what reads it: 0.8 `max_coc` and 8 pixels about it, at the most.
+
+    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
+    a negative `softness`, a bad `taps`, or no `max_coc` under a transform.
+
+    **Gradient:** exact with respect to `image`, `depth`, `softness` and every field of `lens`;
+    zero where a circle is clamped. With a `softness` of 0 that of the leak test is missing.
+
+    Source: Scheuermann 2004, advanced depth of field: the low-resolution picture, the taps, the
+    scales and the leak test. Reconstructed: what bounds a picture whose sides are no multiples
+    of 4 (its last row and column are repeated). Our own: the Vogel spiral, `softness`, and that
+    the leak test reads the tap at full resolution, so that the centre always counts.
+    """
+    image, depth, max_coc = check_arguments("gather", image, depth, lens, max_coc)
+    softness = parameter("gather(softness=...)", softness)
+    check("gather(softness=...)", softness, lambda v: v >= 0, "0 or positive")
+    disc = POISSON if taps is None else vogel(check_count("gather(taps=...)", taps))
+    disc = tuple(map(tuple, np.asarray(disc).tolist()))
+    return _gather(image, depth, lens, softness, max_coc, disc)
+
+
+@ft.partial(jax.jit, static_argnames=("max_coc", "disc"))
+def _gather(image, depth, lens, softness, max_coc, disc):
+    dtype = image.dtype
+    view = defocused(image, depth, lens, max_coc)
+    softness = softness.astype(view.image.dtype)
+    # What is bad is told by its colour, also in the low-resolution picture.
+    image = jnp.where(view.bad[..., None], jnp.nan, view.image)
+    low = low_resolution(image)
+    # One read gives a tap's colour and its defocus.
+    full = jnp.concatenate([image, view.defocus[..., None]], axis=-1)
+    centre = view.defocus
+    radius = jnp.abs(centre)[..., None] / 2
+    points = pixel_centers(image.shape[0], image.shape[1], image.dtype)
+    # On a surface of one depth a tap, which is interpolated, may round to in front.
+    rounding = 8 * jnp.finfo(image.dtype).eps * max_coc
+
+    def add_tap(sums, offset):
+        offset = offset[None, None] * radius
+        high = bilinear(full, points + offset)
+        tap, defocus = high[..., :-1], high[..., -1]
+        blur = jnp.abs(defocus) / max_coc
+        soft = bilinear(low, points / _SIDE + _LOW_RADIUS * offset)
+        tap = mix(tap, soft, blur[..., None])
+        behind = (defocus >= centre - rounding).astype(image.dtype)
+        ahead = (centre - defocus) / jnp.where(softness > 0, softness, 1)
+        behind = jnp.where(softness > 0, clip01(1 - ahead), behind)
+        weight = (behind + (1 - behind) * blur)[..., None]
+        return (sums[0] + weight * tap, sums[1] + weight), None
+
+    zero = jnp.zeros_like(image)
+    offsets = jnp.asarray(disc, image.dtype)
+    (colors, weights), _ = jax.lax.scan(jax.checkpoint(add_tap), (zero, zero[..., :1]), offsets)
+    return (colors / weights).astype(dtype)
+
+
+def mix(
+    one: Float[Array, "height width channel"],
+    other: Float[Array, "height width channel"],
+    share: Float[Array, "height width 1"],
+) -> Float[Array, "height width channel"]:
+    """`one` and a share of `other`, which is not looked at where its share is 0."""
+    return (1 - share) * one + share * jnp.where(share == 0, 0, other)
+
+
+def low_resolution(
+    image: Float[Array, "height width channel"],
+) -> Float[Array, "low_height low_width channel"]:
+    """The means of 4x4 pixels, four bilinear taps in the source, under a 3x3 Gaussian."""
+    height, width, channels = image.shape
+    image = jnp.pad(image, ((0, -height % _SIDE), (0, -width % _SIDE), (0, 0)), mode="edge")
+    blocks = image.reshape(-(-height // _SIDE), _SIDE, -(-width // _SIDE), _SIDE, channels)
+    low = jnp.pad(blocks.mean(axis=(1, 3)), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    low = (low[:-2] + 2 * low[1:-1] + low[2:]) / 4
+    return (low[:, :-2] + 2 * low[:, 1:-1] + low[:, 2:]) / 4
