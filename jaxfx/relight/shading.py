@@ -72,7 +72,7 @@ def shade(
     Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting;
     the models are those of Phong 1975 and Blinn 1977.
     """
-    gbuffer = _checked(gbuffer, {"shade(light)": light})
+    gbuffer = checked(gbuffer, {"shade(light)": light})
     if visibility is not None:
         visibility = parameter("shade(visibility)", visibility, gbuffer.depth.shape)
     return _shade(gbuffer, camera, light, visibility)
@@ -101,7 +101,7 @@ def render(
         kind = type(lights).__name__
         raise ValueError(f"`render(lights)` must be a sequence of lights, got {kind}.")
     named = {f"render(lights[{index}])": light for index, light in enumerate(lights)}
-    return _render(_checked(gbuffer, named), camera, tuple(lights))
+    return _render(checked(gbuffer, named), camera, tuple(lights))
 
 
 class Surface(NamedTuple):
@@ -133,7 +133,6 @@ def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> 
     position = camera.unproject(pixels, depth)
     # Depth 0 is the eye, or the point of its plane that an orthographic ray comes from.
     to_camera = camera.unproject(pixels, jnp.zeros_like(depth)) - position
-    squared_roughness = jnp.maximum(known(gbuffer.roughness, 1, shiny) ** 2, _SMOOTHEST**2)
     return Surface(
         shader=jnp.where(shown, shader, _NOTHING),
         position=position,
@@ -142,22 +141,35 @@ def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> 
         ambient=known(gbuffer.ambient, 0),
         diffuse=known(gbuffer.diffuse, 0),
         specular=known(gbuffer.specular, 0, shiny),
-        exponent=2 / squared_roughness - 2,
+        exponent=exponent(known(gbuffer.roughness, 1, shiny)),
     )
+
+
+def exponent(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The power that a highlight's cosine is raised to."""
+    return 2 / jnp.maximum(roughness**2, _SMOOTHEST**2) - 2
 
 
 def reflected(surface: Surface, light: Light) -> _Vectors:
     """What `surface` sends to the camera under one light."""
-    light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
     if isinstance(light, AmbientLight):
-        image = light.color[None, None] * surface.ambient
+        color = light.color.astype(surface.position.dtype)
+        image = color[None, None] * surface.ambient
     else:
-        to_light, irradiance = _arriving(light, surface.position)
-        cosine = _dot(surface.normal, to_light)
-        diffuse = surface.diffuse * jnp.where(cosine <= 0, 0, cosine)[..., None]
-        specular = surface.specular * _highlight(surface, to_light, cosine)[..., None]
-        image = irradiance * (diffuse + specular)
+        diffuse, specular = received(surface, light)
+        image = surface.diffuse * diffuse + surface.specular * specular
     return jnp.where((surface.shader == _NOTHING)[..., None], 0, image)
+
+
+def received(
+    surface: Surface, light: DirectionalLight | PointLight | SpotLight
+) -> tuple[_Vectors, _Vectors]:
+    """What one light brings for the diffuse and for the specular reflectance to multiply."""
+    light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
+    to_light, irradiance = _arriving(light, surface.position)
+    cosine = _dot(surface.normal, to_light)
+    diffuse = irradiance * jnp.where(cosine <= 0, 0, cosine)[..., None]
+    return diffuse, irradiance * _highlight(surface, to_light, cosine)[..., None]
 
 
 def _arriving(
@@ -213,7 +225,7 @@ def _unit(vector: _Vectors) -> _Vectors:
     return vector / jnp.sqrt(_squared_length(vector))
 
 
-def _checked(gbuffer: GBuffer, lights: dict[str, Any]) -> GBuffer:
+def checked(gbuffer: GBuffer, lights: dict[str, Any]) -> GBuffer:
     """The cache, built again to check its shapes: it may have been edited as a pytree."""
     for name, light in lights.items():
         if not isinstance(light, Light):

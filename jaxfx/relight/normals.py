@@ -1,0 +1,48 @@
+"""Normals from a renderer that only gives pictures."""
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import check_image, normalize
+from jaxfx.light import DirectionalLight
+
+
+def capture_normals(
+    render: Callable[[Sequence[DirectionalLight]], Float[ArrayLike, "height width 3"]],
+) -> Float[Array, "height width 3"]:
+    """Normals, bump maps included, from two pictures under coloured lights.
+
+    A white Lambert surface under a red light on +x, a green one on +y and a blue one on +z
+    shows max(N, 0); under three on the other side, max(-N, 0). The difference is N.
+
+    **Arguments:** `render`: from a sequence of three directional lights to the picture, height
+    width 3, linear RGB, of the scene with every surface white and Lambert, one-sided, and
+    without shadows. The pictures' exposure does not matter: many renderers divide by pi.
+
+    **Returns:** height width 3, unit vectors in world space, zero where both pictures are
+    black.
+
+    **Raises:** `ValueError` where `render` gives no picture of three channels.
+
+    **Gradient:** exact with respect to what `render` depends on; zero where a picture is
+    black.
+
+    Source: Kim, Lee & Kyung, equation 1.
+    """
+    axes = jnp.eye(3)
+    front, back = (
+        check_image(
+            "capture_normals(render)",
+            render([DirectionalLight(-side * axis, axis) for axis in axes]),
+        )
+        for side in (1, -1)
+    )
+    if front.shape[2] != 3 or front.shape != back.shape:
+        raise ValueError(
+            "`capture_normals(render)` must give pictures of one shape (height, width, 3), "
+            f"got {front.shape} and {back.shape}."
+        )
+    return normalize(front - back)

@@ -1,0 +1,462 @@
+"""New views against a plain loop, against fresh caches, and where two surfaces might blend."""
+
+import functools
+import inspect
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx import GBuffer, OrthographicCamera, PinholeCamera, metrics, relight, scene
+
+
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+SIZE = HEIGHT, WIDTH = 24, 32
+MESH = scene.still_life()
+CENTRE = np.array(MESH.viewpoint.target)
+EYE = np.array(MESH.viewpoint.eye)
+FLOATS = ("color", "ambient", "diffuse", "specular", "roughness", "normal")
+
+
+def orbit(degrees, raised=0.0, size=SIZE):
+    """A camera about the still life's centre, turned to the side and raised."""
+    angle = np.radians(degrees)
+    turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    eye = CENTRE + turn @ (EYE - CENTRE) + [0, raised, 0]
+    size = {"height": size[0], "width": size[1]}
+    return PinholeCamera.look_at(eye, CENTRE, up=[0, 1, 0], fov_y=0.8, **size)
+
+
+def cache(camera, size=SIZE):
+    return scene.gbuffer(MESH, camera, height=size[0], width=size[1], backend="embree")
+
+
+def points(camera, depth):
+    """The world's points that a camera sees at a depth, in NumPy."""
+    depth = jnp.asarray(depth)
+    columns, rows = (jnp.arange(0.5, side) for side in depth.shape[::-1])
+    pixels = jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
+    return np.asarray(camera.unproject(pixels, depth))
+
+
+def loop(gbuffers, cameras, target, depth, field, tolerance):
+    """Equations 2 and 3, pixel by pixel, gated by the distance along the ray alone."""
+    image, coverage = np.zeros((*depth.shape, 3)), np.zeros(depth.shape, int)
+
+    def split(camera):
+        pose = np.asarray(camera.world_from_camera, float)
+        return np.asarray(camera.intrinsics, float), pose[:3, :3], pose[:3, 3]
+
+    intrinsics, turn, eye = split(target)
+    for j, i in np.ndindex(depth.shape):
+        ray = np.linalg.inv(intrinsics) @ [i + 0.5, j + 0.5, 1]
+        position = turn @ (ray * depth[j, i]) + eye
+        values = []
+        for gbuffer, camera in zip(gbuffers, cameras, strict=True):
+            k, r, t = split(camera)
+            x, y, z = k @ r.T @ (position - t)
+            column, row = int(np.floor(x / z)), int(np.floor(y / z))
+            if z <= 0 or not (0 <= row < HEIGHT and 0 <= column < WIDTH):
+                continue
+            if abs(float(gbuffer.depth[row, column]) - z) <= tolerance * z:
+                values.append(np.asarray(getattr(gbuffer, field))[row, column])
+        coverage[j, i] = len(values)
+        image[j, i] = np.mean(values, axis=0) if values else 0
+    return image, coverage
+
+
+def plane(normal, *, size=SIZE, shader=0, offset=0.0):
+    """Caches of a plane through (0, 0, 3), in closed form; its colours are the camera's own."""
+    normal = np.asarray(normal, float) / np.linalg.norm(normal)
+
+    def of(camera, color=None):
+        rng = np.random.default_rng([*np.asarray(camera.world_from_camera).tobytes()])
+        near, far = (points(camera, np.full(size, depth)) for depth in (1.0, 2.0))
+        rate = (far - near) @ normal
+        depth = 1 + (np.array([0, 0, 3.0 + offset]) - near) @ normal / rate
+        image = rng.uniform(0.2, 1, (*size, 3)) if color is None else np.full((*size, 3), color)
+        facing = normal * -np.sign(rate)[..., None]
+        return GBuffer(
+            *(image, np.full(size, shader), image, image, image, facing),
+            depth=np.where(depth > 0, depth, np.inf),
+            roughness=image[..., 0],
+        )
+
+    return of
+
+
+def pinhole(x=0.0, y=0.0):
+    return PinholeCamera.look_at(
+        [x, y, 0], [0, 0, 3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
+    )
+
+
+FRONTAL = plane([0, 0, -1])
+CAMERAS = [pinhole(-0.4), pinhole(0.3, 0.2), pinhole(0.1, -0.3)]
+TARGET = pinhole(0.05, 0.04)
+
+
+def test_the_same_camera_gives_the_same_cache():
+    camera = orbit(0)
+    gbuffer = cache(camera)
+    found, coverage = relight.synthesize([gbuffer], [camera], camera, depth=gbuffer.depth)
+    np.testing.assert_array_equal(coverage, np.isfinite(gbuffer.depth))
+    for name in (*FLOATS, "shader", "depth"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(gbuffer, name), rtol=1e-6, atol=1e-6, err_msg=name
+        )
+        assert getattr(found, name).dtype == getattr(gbuffer, name).dtype
+
+
+def test_equals_the_loop_over_pixels():
+    """On a plane that faces the cameras more or less, where the tests agree."""
+    gbuffers = [FRONTAL(camera) for camera in CAMERAS]
+    depth = np.asarray(FRONTAL(TARGET).depth)
+    found, coverage = relight.synthesize(gbuffers, CAMERAS, TARGET, depth=depth, tolerance=0.03)
+    image, expected = loop(gbuffers, CAMERAS, TARGET, depth, "diffuse", 0.03)
+    assert {2, 3} <= set(np.unique(expected))
+    np.testing.assert_array_equal(coverage, expected)
+    np.testing.assert_allclose(found.diffuse, image, rtol=1e-12)
+
+
+def test_caches_of_other_sizes_and_cameras():
+    """An orthographic cache of another size, of a plane of one colour."""
+    size = (40, 20)
+    camera = OrthographicCamera(15.0, [10, 20], np.eye(4))
+    gbuffer = plane([0.3, 0, -1], size=size)(camera, color=0.6)
+    depth = plane([0.3, 0, -1])(TARGET).depth
+    found, coverage = relight.synthesize([gbuffer], [camera], TARGET, depth=depth)
+    pixels, _ = camera.project(jnp.asarray(points(TARGET, depth)))
+    x, y = np.moveaxis(np.asarray(pixels), -1, 0)
+    inside = (x >= 0) & (x < 20) & (y >= 0) & (y < 40)
+    assert 0 < inside.sum() < inside.size
+    np.testing.assert_array_equal(coverage, inside)
+    expected = np.broadcast_to(np.where(inside, 0.6, 0)[..., None], (*SIZE, 3))
+    np.testing.assert_allclose(found.color, expected)
+
+
+def test_an_oblique_plane_is_seen_whole_although_its_depth_is_steep():
+    """80 degrees off: within a pixel the depth changes by 20 tolerances and more."""
+    steep, tolerance = plane([0, -np.sin(1.4), -np.cos(1.4)]), 1e-3
+    camera = pinhole(-0.39)
+    depth = np.asarray(steep(camera).depth)
+    near = depth < 3.5
+    with np.errstate(invalid="ignore"):
+        rise = np.abs(np.diff(depth, axis=0, append=np.nan)) / depth
+    assert np.nanmax(rise[near]) > 20 * tolerance
+    caches = [steep(CAMERAS[0])], [CAMERAS[0]]
+    _, coverage = relight.synthesize(*caches, camera, depth=depth, tolerance=tolerance)
+    assert (np.asarray(coverage) > 0)[near].mean() > 0.9
+
+
+# --- New views of the still life.
+
+
+def psnr(image, reference, mask=None):
+    return float(metrics.psnr(image, reference, mask=mask))
+
+
+LARGE = (96, 128)
+AROUND = [
+    (-6, 0.0),
+    (6, 0.0),
+    (0, 0.25),
+    (0, -0.2),
+    (-14, 0.1),
+    (14, 0.1),
+    (-10, 0.4),
+    (10, 0.4),
+]
+
+
+@pytest.fixture(scope="module")
+def caches():
+    cameras = [orbit(*where, size=LARGE) for where in AROUND]
+    return [cache(camera, LARGE) for camera in cameras], cameras
+
+
+def new_view(caches, count, degrees):
+    gbuffers, cameras = (each[:count] for each in caches)
+    target = orbit(degrees, 0.1, LARGE)
+    truth = cache(target, LARGE)
+    found, coverage = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
+    return target, truth, found, np.asarray(coverage)
+
+
+@pytest.mark.parametrize("degrees", [5, 15, 30])
+def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
+    """PSNR of every parameter, ids exact, and the relit picture, filled and outside holes."""
+    shares = []
+    for count in (1, 2, 4, 8):
+        target, truth, found, coverage = new_view(caches, count, degrees)
+        shown = np.asarray(truth.shader) >= 0
+        seen = coverage > 0
+        assert not seen[~shown].any() and coverage.max() <= count
+        shares.append(seen[shown].mean())
+        assert set(np.unique(found.shader)) <= {-1, 0, 2}
+        wrong = np.asarray(found.shader != truth.shader)[seen]
+        assert wrong.mean() < 0.005
+        for name in ("color", "diffuse", "specular", "normal"):
+            assert psnr(getattr(found, name), getattr(truth, name), seen) > 18, name
+        np.testing.assert_array_equal(found.depth, truth.depth)
+        length = np.linalg.norm(np.asarray(found.normal), axis=-1)
+        np.testing.assert_allclose(length, seen, atol=1e-5)
+
+        filled, holes = relight.fill_holes(found, coverage)
+        assert int(holes) == (shown & ~seen).sum()
+        assert (np.asarray(filled.shader)[shown] >= 0).all()
+        lights = scene.default_lights(target)
+        pictures = [relight.render(each, target, lights) for each in (truth, found, filled)]
+        assert psnr(pictures[2], pictures[0]) >= psnr(pictures[1], pictures[0])
+        assert psnr(pictures[1], pictures[0], seen) > 20
+    assert shares == sorted(shares) and shares[0] > 0.4
+    assert shares[-1] > {5: 0.98, 15: 0.95, 30: 0.8}[degrees]
+
+
+# --- Two surfaces must not blend.
+
+
+def spread(values):
+    """The largest distance of a pixel's colour from the nearest of the two pure ones."""
+    values = np.asarray(values)
+    return np.minimum(np.abs(values - RED).max(-1), np.abs(values - BLUE).max(-1)).max()
+
+
+RED, BLUE = np.array([0.9, 0.1, 0.1]), np.array([0.1, 0.1, 0.9])
+
+
+def split_view(one, other, camera, edge):
+    """A cache that shows one plane left of the world's `x = edge` on it, the other right."""
+    left, right = one(camera), other(camera)
+    x = points(camera, left.depth)[..., 0]
+    choose = lambda a, b: np.where((x < edge).reshape(x.shape + (1,) * (a.ndim - 2)), a, b)
+    return jax.tree.map(choose, left, right)
+
+
+def of_color(plane_of, color):
+    return lambda camera: plane_of(camera, color=color)
+
+
+def check_no_blend(one, other, tolerance=0.005, edge=0.1):
+    """No colour but the two, and each where its plane is, save half a pixel about the edge."""
+    one, other = of_color(one, RED), of_color(other, BLUE)
+    gbuffers = [split_view(one, other, camera, edge) for camera in CAMERAS]
+    truth = split_view(one, other, TARGET, edge)
+    found, coverage = relight.synthesize(
+        gbuffers, CAMERAS, TARGET, depth=truth.depth, tolerance=tolerance
+    )
+    covered = np.asarray(coverage) > 0
+    assert covered.mean() > 0.9
+    assert spread(np.asarray(found.color)[covered]) < 1e-6
+    wrong = (np.abs(np.asarray(found.color - truth.color)).max(-1) > 1e-6) & covered
+    assert wrong.sum() <= HEIGHT
+    np.testing.assert_array_equal(
+        found.shader[covered & ~wrong], truth.shader[covered & ~wrong]
+    )
+
+
+def test_a_cliff_does_not_blend():
+    check_no_blend(FRONTAL, plane([0, 0, -1], offset=1.0))
+
+
+def test_close_surfaces_of_two_shaders_do_not_blend():
+    """0.3 of the tolerance apart."""
+    check_no_blend(FRONTAL, plane([0, 0, -1], offset=0.0045, shader=2))
+
+
+def test_close_surfaces_do_not_blend_where_a_cache_fits_better():
+    check_no_blend(FRONTAL, plane([0, 0, -1], offset=0.0045))
+
+
+def test_close_surfaces_of_two_normals_do_not_blend():
+    check_no_blend(FRONTAL, plane([0.7, 0, -1], offset=0.0), edge=0.0)
+
+
+def test_a_thin_sheet_seen_from_both_sides_has_the_normal_that_faces_the_camera():
+    """Mirrored normals: their mean would be nothing."""
+    behind = PinholeCamera.look_at(
+        [0, 0, 6], [0, 0, 3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
+    )
+    front = FRONTAL(CAMERAS[0], color=RED)
+    back = FRONTAL(behind, color=BLUE)
+    assert float(back.normal[0, 0, 2]) == 1
+    depth = FRONTAL(TARGET).depth
+    for order in ([0, 1], [1, 0]):
+        pairs = [((front, CAMERAS[0]), (back, behind))[i] for i in order]
+        found, coverage = relight.synthesize(*zip(*pairs, strict=True), TARGET, depth=depth)
+        covered = np.asarray(coverage) > 0
+        assert covered.mean() > 0.5
+        assert np.asarray(coverage).max() == 1
+        np.testing.assert_allclose(np.asarray(found.color)[covered] - RED, 0, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(found.normal)[covered][:, 2], -1)
+
+
+def test_ids_are_never_averaged():
+    """Shaders 0 and 2 of one surface: the answer is either, never 1."""
+    gbuffers = [plane([0, 0, -1], shader=s)(c) for s, c in zip((0, 2, 2), CAMERAS, strict=True)]
+    found, _ = relight.synthesize(gbuffers, CAMERAS, TARGET, depth=FRONTAL(TARGET).depth)
+    assert set(np.unique(found.shader)) <= {-1, 0, 2}
+
+
+def test_normals_are_averaged_on_the_sphere():
+    one, other = np.array([0.3, 0, -1]), np.array([-0.1, 0.2, -1])
+    bent = []
+    for camera, normal in zip(CAMERAS, (one, other, other), strict=True):
+        unit = normal / np.linalg.norm(normal)
+        image = jnp.broadcast_to(jnp.asarray(unit), (*SIZE, 3))
+        bent.append(eqx.tree_at(lambda g: g.normal, FRONTAL(camera), image))
+    found, coverage = relight.synthesize(
+        bent, CAMERAS, TARGET, depth=FRONTAL(TARGET).depth, tolerance=0.1, angle=0.6
+    )
+    total = one / np.linalg.norm(one) + 2 * other / np.linalg.norm(other)
+    full = np.asarray(coverage) == 3
+    assert full.any()
+    np.testing.assert_allclose(
+        np.asarray(found.normal)[full] - total / np.linalg.norm(total), 0, atol=1e-12
+    )
+
+
+def test_zero_normals_are_gated_by_depth_alone():
+    bare = [eqx.tree_at(lambda g: g.normal, FRONTAL(c), jnp.zeros((*SIZE, 3))) for c in CAMERAS]
+    depth = FRONTAL(TARGET).depth
+    found, coverage = relight.synthesize(bare, CAMERAS, TARGET, depth=depth, tolerance=0.03)
+    _, expected = relight.synthesize(
+        [FRONTAL(c) for c in CAMERAS], CAMERAS, TARGET, depth=depth, tolerance=0.03
+    )
+    assert (np.asarray(coverage > 0) == np.asarray(expected > 0)).all()
+    assert np.isfinite(found.color).all() and not np.asarray(found.normal).any()
+
+
+@pytest.mark.parametrize("name", ["color", "normal", "depth", "roughness"])
+def test_a_bad_pixel_of_a_cache_reaches_only_those_that_read_it(name):
+    gbuffers = [FRONTAL(camera) for camera in CAMERAS]
+    depth = FRONTAL(TARGET).depth
+    good, _ = relight.synthesize(gbuffers, CAMERAS, TARGET, depth=depth)
+    image = getattr(gbuffers[1], name).at[12, 15].set(jnp.nan)
+    gbuffers[1] = eqx.tree_at(lambda g: getattr(g, name), gbuffers[1], image)
+    bad, _ = relight.synthesize(gbuffers, CAMERAS, TARGET, depth=depth)
+    # A cache that is bad there is left out, but where its colours are.
+    changed = np.asarray((good.color != bad.color).any(-1) | (good.roughness != bad.roughness))
+    assert 1 <= changed.sum() <= 4
+    kept = jax.tree.map(lambda image: np.asarray(image)[~changed], bad)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(kept))
+    if name in ("normal", "depth"):
+        assert np.isfinite(bad.color).all()
+
+
+def test_detail_favours_the_camera_that_is_nearer():
+    near = PinholeCamera.look_at(
+        [0, 0, 2], [0, 0, 3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
+    )
+    cameras = [CAMERAS[1], near]
+    gbuffers = [FRONTAL(cameras[0], color=RED), FRONTAL(near, color=BLUE)]
+    depth = FRONTAL(TARGET).depth
+    red = {
+        weights: relight.synthesize(
+            gbuffers, cameras, TARGET, depth=depth, weights=weights, tolerance=0.1
+        )
+        for weights in ("equal", "detail")
+    }
+    both = np.asarray(red["equal"][1]) == 2
+    assert both.any()
+    np.testing.assert_allclose(np.asarray(red["equal"][0].color)[both][:, 0], 0.5)
+    # The pixels of each on a unit of the plane: 1 / depth**2, times the cosine.
+    far = np.linalg.norm([0.3, 0.2, 3])
+    expected = 3 / far / far**2 / (3 / far / far**2 + 1)
+    middle = both & (np.abs(points(TARGET, depth) - [0, 0, 3]).max(-1) < 0.05)
+    assert middle.any()
+    np.testing.assert_allclose(
+        (np.asarray(red["detail"][0].color)[middle][:, 0] - 0.1) / 0.8, expected, rtol=0.05
+    )
+
+
+# --- Derivatives.
+
+
+@pytest.mark.parametrize("weights", ["equal", "detail"])
+def test_derivatives_in_the_caches_and_cameras(weights):
+    """Forward, reverse and differences: in float64 the steps move no point to another pixel."""
+    tilted = plane([0.1, 0.2, -1])
+    gbuffers = [tilted(camera) for camera in CAMERAS[:2]]
+    floats, others = eqx.partition(gbuffers, eqx.is_inexact_array)
+    arguments = floats, CAMERAS[:2], TARGET, tilted(TARGET).depth
+    along = jax.tree.map(lambda leaf: jnp.cos(7 * leaf), arguments)
+
+    def loss(floats, cameras, target, depth):
+        gbuffers = eqx.combine(floats, others)
+        found, _ = relight.synthesize(
+            gbuffers, cameras, target, depth=depth, weights=weights, tolerance=0.05
+        )
+        images = eqx.filter(found, eqx.is_inexact_array)
+        return sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(images))
+
+    @quick_jit
+    def derivatives(arguments, along):
+        pushed = jax.jvp(loss, arguments, along)[1]
+        return pushed, jax.grad(loss, argnums=(0, 1, 2, 3))(*arguments)
+
+    pushed, pulled = derivatives(arguments, along)
+    value = quick_jit(lambda h: loss(*jax.tree.map(lambda x, v: x + h * v, arguments, along)))
+    quotient = float(value(1e-7) - value(-1e-7)) / 2e-7
+    assert float(pushed) == pytest.approx(quotient, rel=1e-5)
+    pairs = zip(jax.tree.leaves(pulled), jax.tree.leaves(along), strict=True)
+    assert float(pushed) == pytest.approx(float(sum(jnp.vdot(*p) for p in pairs)), rel=1e-9)
+
+
+# --- The choice of caches.
+
+
+def test_best_caches_sees_most_first_and_never_twice(caches):
+    gbuffers, cameras = caches
+    target = orbit(12, 0.1, LARGE)
+    depth = cache(target, LARGE).depth
+    order = np.asarray(relight.best_caches(gbuffers, cameras, target, depth=depth, count=8))
+    assert sorted(order) == list(range(8))
+    assert order[0] == 5  # two degrees away; the next is six
+    covered = lambda which: np.mean(
+        relight.synthesize(
+            [gbuffers[i] for i in which], [cameras[i] for i in which], target, depth=depth
+        )[1]
+        > 0
+    )
+    # Three of them do better than the first three, and than any one.
+    assert covered(order[:3]) > covered([0, 1, 2])
+    assert covered(order[:1]) >= max(covered([i]) for i in range(8)) - 0.02
+
+
+def test_best_caches_passes_over_one_that_looks_away():
+    away = PinholeCamera.look_at(
+        [0, 0, 0], [0, 0, -3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
+    )
+    cameras = [away, *CAMERAS]
+    gbuffers = [FRONTAL(camera) for camera in cameras]
+    depth = FRONTAL(TARGET).depth
+    order = relight.best_caches(gbuffers, cameras, TARGET, depth=depth, count=4, stride=3)
+    assert int(order[-1]) == 0
+
+
+def test_errors_name_the_argument():
+    synthesize = inspect.unwrap(relight.synthesize)
+    best = inspect.unwrap(relight.best_caches)
+    gbuffer, depth = FRONTAL(TARGET), FRONTAL(TARGET).depth
+    with pytest.raises(ValueError, match=r"`synthesize\(gbuffers\)` must be a sequence of at"):
+        synthesize([], [], TARGET, depth=depth)
+    with pytest.raises(ValueError, match=r"`synthesize\(gbuffers\)` must be a sequence"):
+        synthesize(gbuffer, TARGET, TARGET, depth=depth)
+    with pytest.raises(ValueError, match=r"`synthesize\(cameras\)` must be one for each cache"):
+        synthesize([gbuffer], CAMERAS, TARGET, depth=depth)
+    with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must have shape"):
+        synthesize([gbuffer], [TARGET], TARGET, depth=depth[0])
+    with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must be positive"):
+        synthesize([gbuffer], [TARGET], TARGET, depth=-depth)
+    for name, value in (("tolerance", 0.0), ("angle", -1.0)):
+        with pytest.raises(ValueError, match=rf"`synthesize\({name}=...\)` must be positive"):
+            synthesize([gbuffer], [TARGET], TARGET, depth=depth, **{name: value})
+    for count in (0, 2):
+        with pytest.raises(ValueError, match=r"`best_caches\(count=...\)` must be in \[1, 1\]"):
+            best([gbuffer], [TARGET], TARGET, depth=depth, count=count)
+    with pytest.raises(ValueError, match=r"`best_caches\(stride=...\)` must be at least 1"):
+        best([gbuffer], [TARGET], TARGET, depth=depth, count=1, stride=0)
