@@ -5,7 +5,7 @@ rest. World axes are the mesh file's own (y up in most of them); cameras are thi
 """
 
 from jaxfx.scene._load import from_trimesh, load
-from jaxfx.scene._render import depth, gbuffer, object_ids
+from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Material, Scene, Viewpoint
 from jaxfx.scene._still_life import still_life
 from jaxfx.scene._view import default_camera, default_lights
@@ -21,6 +21,7 @@ __all__ = [
     "from_trimesh",
     "gbuffer",
     "load",
+    "material_ids",
     "object_ids",
     "still_life",
 ]

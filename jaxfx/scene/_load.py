@@ -12,6 +12,7 @@ from jaxfx.scene._scene import Material, Scene
 
 
 _PLAIN = Material(color=(0.8, 0.8, 0.8))
+_PICTURES = ("image", "baseColorTexture", "metallicRoughnessTexture", "normalTexture")
 _Decode = Callable[[np.ndarray], np.ndarray]
 
 
@@ -20,8 +21,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
 
     Anything that trimesh reads: OBJ, PLY, GLB, STL and more. Pictures and the colours of OBJ
     and PLY files are taken to be sRGB; glTF's factors and vertex colours are linear, as its
-    standard says (trimesh rounds a factor to 1/255). Alpha, normal maps, occlusion and
-    emission are left out. An OBJ material's exponent Ns becomes the roughness
+    standard says (trimesh rounds a factor to 1/255). Alpha, occlusion, emission and
+    OBJ's bump maps are left out. An OBJ material's exponent Ns becomes the roughness
     sqrt(2 / (Ns + 2)), and 1 where its Ks is black.
 
     **Arguments:** `path`: the file.
@@ -202,6 +203,7 @@ def _pbr(material: Any, has_uv: bool) -> Material:
         metallic=1.0 if metallic is None else float(np.clip(metallic, 0, 1)),
         roughness=1.0 if roughness is None else float(np.clip(roughness, 0, 1)),
         metallic_roughness=_picture(both) if has_uv else None,
+        normal_map=_picture(material.normalTexture) if has_uv else None,
     )
 
 
@@ -236,7 +238,7 @@ def _decode_pictures(geometry: Any) -> None:
     """Make PIL read the pictures now, so that a broken one is `load`'s error."""
     material = getattr(getattr(geometry, "visual", None), "material", None)
     for each in getattr(material, "materials", [material]):
-        for name in ("image", "baseColorTexture", "metallicRoughnessTexture"):
+        for name in _PICTURES:
             picture = getattr(each, name, None)
             if picture is not None:
                 picture.load()

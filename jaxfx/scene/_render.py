@@ -36,8 +36,8 @@ def gbuffer(
 
     Base colour is texture x factor x vertex colour in linear light. `ambient` is the base
     colour, `diffuse` base * (1 - metallic), `specular` the mix of 0.04 and base by metallic.
-    The shader is Lambert where a surface is rough and no metal, Blinn elsewhere. Normals face
-    the camera, whichever side of a face is seen.
+    The shader is Lambert where a surface is rough and no metal, Blinn elsewhere. Normals are
+    bent by the material's normal map and face the camera, whichever side of a face is seen.
 
     **Arguments:**
 
@@ -118,8 +118,39 @@ def object_ids(
     height, width = check_size("object_ids", height, width)
     view = View.of(camera, "scene.object_ids")
     hits = _visible("object_ids", scene, view, height, width, backend, layer)
+    return _ids(hits, scene.face_objects, height, width)
+
+
+def material_ids(
+    scene: Scene,
+    camera: _Camera,
+    *,
+    height: int,
+    width: int,
+    backend: str = "auto",
+    layer: int = 0,
+) -> Int[Array, "height width"]:
+    """Which material each pixel's centre shows, as an index into `scene.materials`.
+
+    **Arguments:** as in `gbuffer`.
+
+    **Returns:** height width, int32; -1 where there is nothing.
+
+    **Raises:** as `depth`.
+
+    **Gradient:** none: these are integers.
+    """
+    height, width = check_size("material_ids", height, width)
+    view = View.of(camera, "scene.material_ids")
+    hits = _visible("material_ids", scene, view, height, width, backend, layer)
+    return _ids(hits, scene.face_materials, height, width)
+
+
+def _ids(
+    hits: Hits, of_face: Int[np.ndarray, " face"], height: int, width: int
+) -> Int[Array, "height width"]:
     ids = np.full(height * width, -1, np.int32)
-    ids[hits.pixel] = scene.face_objects[hits.face]
+    ids[hits.pixel] = of_face[hits.face]
     return jnp.asarray(ids.reshape(height, width))
 
 

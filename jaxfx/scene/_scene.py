@@ -21,6 +21,8 @@ class Material:
     - `metallic`, `roughness`: in [0, 1].
     - `metallic_roughness`: height width 3, linear bytes that multiply the two: roughness in
       green, metallic in blue; or None.
+    - `normal_map`: height width 3, linear bytes; 2 * value - 1 is the normal along u, along v
+      and off the surface; or None.
 
     **Raises:** `ValueError` for a number out of range or another kind of picture.
 
@@ -32,6 +34,7 @@ class Material:
     metallic: float | int = 0.0
     roughness: float | int = 1.0
     metallic_roughness: UInt8[np.ndarray, "rows columns 3"] | None = None
+    normal_map: UInt8[np.ndarray, "lines samples 3"] | None = None
 
     def __post_init__(self):
         if np.shape(self.color) != (3,) or not np.isfinite(self.color).all():
@@ -40,7 +43,7 @@ class Material:
             value = getattr(self, name)
             if not 0 <= value <= 1:
                 raise ValueError(f"`Material({name}=...)` must be in [0, 1], got {value}.")
-        for name in ("texture", "metallic_roughness"):
+        for name in ("texture", "metallic_roughness", "normal_map"):
             picture = getattr(self, name)
             if picture is None:
                 continue

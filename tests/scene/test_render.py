@@ -67,7 +67,7 @@ def test_nothing_in_view(backend, ball):
         np.testing.assert_array_equal(ids, -1)
 
 
-@pytest.mark.parametrize("name", ["gbuffer", "depth", "object_ids"])
+@pytest.mark.parametrize("name", ["gbuffer", "depth", "object_ids", "material_ids"])
 def test_bad_arguments(name, ball, view):
     # The annotations, checked in these tests, would speak first.
     call = inspect.unwrap(getattr(scene, name))

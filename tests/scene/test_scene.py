@@ -74,6 +74,7 @@ def test_bad_scenes(changes, complaint):
         {"color": (1.0, 2.0)},
         {"texture": np.zeros((2, 2, 3))},
         {"metallic_roughness": np.zeros((2, 2), np.uint8)},
+        {"normal_map": np.zeros((2, 2, 3))},
     ],
 )
 def test_bad_materials(wrong):
