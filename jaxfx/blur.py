@@ -308,42 +308,54 @@ def _padded(
 def _unpadded(
     sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
 ) -> Float[Array, "h w c"]:
-    """Without a copy of the image: it is read twice and written twice.
+    """Without a copy of the image: it is read once and written once by each pass.
 
-    Down the columns, rows are named by their index, clamped to the image. Along the rows, a tap
-    is the flat image moved by some pixels, which runs on into the next row at either border:
-    there the result is computed apart, in two strips, and put in its place.
+    Along the rows, a tap is the flat image moved by some pixels, which runs on into the next
+    row at either border. There the result is computed apart, in two strips, and then put in.
     """
     height, width, channels = image.shape
     total, half = ft.partial(_SUMS[sampling], weights), weights.size // 2
     row, reach = width * channels, half * channels
 
-    flat = image.reshape(height, row)
-    indices = np.arange(height)[:, None] + np.arange(-half, half + 1)
-    indices = jnp.asarray(indices.clip(0, height - 1))
-    columns = total(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
-    # A row of zeros about it, for the flat image's ends. XLA keeps what is padded in memory,
-    # where it would compute the sum anew for every tap that reads it.
-    zero = jnp.zeros((), image.dtype)
-    columns = lax.pad(columns, zero, ((1, 1, 0), (0, 0, 0))).reshape(-1)
+    columns = _columns(total, image.reshape(height, row), half).reshape(-1)
 
     def moved(i: int) -> Array:
-        start = row - reach + i * channels
+        start = row + (i - half) * channels
         return lax.slice_in_dim(columns, start, start + height * row)
 
-    result = total(moved).reshape(height, row)
-    strips = [
-        _padded(sampling, side, weights)
-        for side in (image[:, : 2 * half], image[:, -2 * half :])
-    ]
-    left, right = (strip.reshape(height, -1) for strip in strips)
-    strips = jnp.stack([left[:, :reach], right[:, -reach:]])
+    whole = total(moved).reshape(height, row)
 
-    # In a loop: outside of one, XLA computes the whole result again to put a strip into it.
-    def put(i: Array, result: Array) -> Array:
-        return lax.dynamic_update_slice_in_dim(result, strips[i], i * (row - reach), axis=1)
+    edges = [jnp.repeat(image[:, i : i + 1], half, axis=1) for i in (0, width - 1)]
+    ends = [image[:, : 2 * half], image[:, width - 2 * half :]]
+    sides = jnp.concatenate([edges[0], *ends, edges[1]], axis=1).reshape(height, -1)
+    sides = _columns(total, sides, half)
 
-    return lax.fori_loop(0, 2, put, result).reshape(image.shape)
+    def beside(i: int) -> Array:
+        return lax.slice_in_dim(sides, i * channels, i * channels + 4 * reach, axis=1)
+
+    sides = total(beside)
+
+    # In a loop: outside of one, XLA computes the whole again to put a strip into it.
+    def put(i: Array, whole: Array) -> Array:
+        strip = lax.dynamic_slice(sides, (1, i * (3 * reach)), (height, reach))
+        return lax.dynamic_update_slice(whole, strip, (0, i * (row - reach)))
+
+    return lax.fori_loop(0, 2, put, whole).reshape(image.shape)
+
+
+def _columns(
+    total: Callable[[Tap], Array], flat: Float[Array, "h wc"], half: int
+) -> Float[Array, "h+2 wc"]:
+    """The pass down the columns, with a row of zeros above and one below.
+
+    Rows are named by their index, held within the image. XLA keeps in memory what is padded,
+    where it would compute a bare sum anew for every tap that reads it.
+    """
+    height = flat.shape[0]
+    indices = np.arange(height)[:, None] + np.arange(-half, half + 1)
+    indices = jnp.asarray(indices.clip(0, height - 1))
+    sums = total(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
+    return lax.pad(sums, jnp.zeros((), flat.dtype), ((1, 1, 0), (0, 0, 0)))
 
 
 @jax.jit
