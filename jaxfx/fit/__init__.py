@@ -1,6 +1,16 @@
 """Parameters of the effects from pictures, by optimistix."""
 
 from jaxfx.fit.dof import PARAMETERS, DofFit, dof
+from jaxfx.fit.lights import LIGHT_PARAMETERS, LightsFit, lights
+from jaxfx.fit.moving_shadow import MovingShadow
 
 
-__all__ = ["PARAMETERS", "DofFit", "dof"]
+__all__ = [
+    "LIGHT_PARAMETERS",
+    "PARAMETERS",
+    "DofFit",
+    "LightsFit",
+    "MovingShadow",
+    "dof",
+    "lights",
+]

@@ -1,0 +1,347 @@
+"""The fit of lights: what lit a picture is found in it; what can't be told apart is said."""
+
+import functools
+import inspect
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+import trimesh
+
+from jaxfx import (
+    AmbientLight,
+    DirectionalLight,
+    GBuffer,
+    OrthographicCamera,
+    PinholeCamera,
+    PointLight,
+    SpotLight,
+    fit,
+    relight,
+    scene,
+)
+from jaxfx._sampling import pixel_centers
+
+
+SIZE = 32
+CAMERA = OrthographicCamera(SIZE / 4, jnp.array([SIZE / 2, SIZE / 2]), jnp.eye(4))
+WHITE = np.ones(3)
+
+TRUTH = (
+    DirectionalLight([0.3, 0.5, 1.0], [1.0, 0.9, 0.7]),
+    PointLight([-1.0, -1.2, 2.0], [1.0, 2.0, 3.0]),
+    SpotLight([1.5, -0.5, 1.0], [-0.3, 0.2, 1.0], [4.0, 3.0, 2.0], 0.2, 0.5),
+)
+# 20 degrees off, a third to a half of the way to the surface, cones too blunt or too sharp.
+WRONG = [
+    (
+        DirectionalLight([0.6, 0.3, 1.0], WHITE),
+        PointLight([-0.6, -0.8, 1.6], WHITE),
+        SpotLight([1.2, -0.2, 0.7], [-0.1, 0.0, 1.0], WHITE, 0.15, 0.65),
+    ),
+    (
+        DirectionalLight([0.0, 0.6, 1.0], WHITE),
+        PointLight([-1.3, -0.8, 2.2], WHITE),
+        SpotLight([1.7, -0.8, 1.2], [-0.4, 0.3, 1.0], WHITE, 0.25, 0.45),
+    ),
+]
+
+
+@functools.cache
+def cache(dtype=np.float64):
+    """A shiny ball before a matt wave, of random colours, seen from z = 0."""
+    rng = np.random.default_rng(0)
+    y, x = (np.mgrid[:SIZE, :SIZE] + 0.5) / SIZE * 4 - 2
+    depth = 4 + 0.3 * np.sin(2 * x) * np.cos(1.5 * y)
+    slopes = 0.6 * np.cos(2 * x) * np.cos(1.5 * y), -0.45 * np.sin(2 * x) * np.sin(1.5 * y)
+    normal = np.stack([*slopes, -np.ones_like(x)], axis=-1)
+    ball = x * x + y * y < 1
+    front = np.sqrt(np.maximum(1 - x * x - y * y, 0))
+    depth = np.where(ball, 4 - front, depth)
+    normal = np.where(ball[..., None], np.stack([x, y, -front], axis=-1), normal)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    base = rng.uniform(0.3, 0.8, (SIZE, SIZE, 3))
+    images = base, base, base, np.full_like(base, 0.3), normal, depth, np.full_like(x, 0.3)
+    color, ambient, diffuse, specular, normal, depth, roughness = (
+        image.astype(dtype) for image in images
+    )
+    shader = np.where(ball, 2, 0)
+    return GBuffer(color, shader, ambient, diffuse, specular, normal, depth, roughness)
+
+
+def wall(dtype=np.float64):
+    """A matt plane that faces the camera."""
+    plain = cache(dtype)
+    normal = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (SIZE, SIZE, 3))
+    shader, depth = np.zeros((SIZE, SIZE), int), np.full((SIZE, SIZE), 4.0)
+    images = plain.ambient, plain.diffuse, plain.specular
+    return GBuffer(plain.color, shader, *images, normal, depth, plain.roughness)
+
+
+def quietly(reference, gbuffer, lights, **options):
+    return fit.lights(reference, gbuffer, CAMERA, lights, progress=False, **options)
+
+
+def colors_of(reference, gbuffer, lights, **options):
+    return quietly(reference, gbuffer, lights, parameters=("color",), **options)
+
+
+def assert_close(found, truth, tolerance=0.01):
+    """Of every field, its length being 1; directions are unit vectors."""
+    for light, true in zip(found, truth, strict=True):
+        for name in vars(true):
+            value, wanted = (np.asarray(getattr(each, name)) for each in (light, true))
+            if name == "direction":
+                value, wanted = (each / np.linalg.norm(each) for each in (value, wanted))
+            assert np.linalg.norm(value - wanted) < tolerance * np.linalg.norm(wanted), name
+
+
+@functools.cache
+def picture(dtype=np.float64):
+    return relight.render(cache(dtype), CAMERA, TRUTH)
+
+
+@pytest.mark.parametrize("start", WRONG, ids=["far", "near"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_recovers_three_lights(dtype, start):
+    fitted = quietly(picture(dtype), cache(dtype), start)
+    assert fitted.success and fitted.image.dtype == dtype
+    assert_close(fitted.lights, TRUTH)
+    assert fitted.indistinct == ()
+    assert fitted.losses[-1] < 1e-6 * fitted.losses[0]
+    np.testing.assert_allclose(fitted.image, picture(dtype), atol=1e-3)
+
+
+def test_brightness_does_not_matter():
+    """Nor do the start's colours, which are never used."""
+    start = [type(light)(**vars(light) | {"color": 0 * WHITE}) for light in WRONG[0]]
+    fitted = quietly(1e-5 * picture(), cache(), start)
+    expected = [type(light)(**vars(light) | {"color": 1e-5 * light.color}) for light in TRUTH]
+    assert_close(fitted.lights, expected)
+    np.testing.assert_allclose(fitted.losses[-1], 0, atol=1e-14)
+
+
+def test_what_is_frozen_stays():
+    start = (TRUTH[0], TRUTH[1], WRONG[0][2])
+    fitted = quietly(picture(), cache(), start, parameters=("direction", "angles", "position"))
+    assert [np.array(light.color).tolist() for light in fitted.lights] == [
+        light.color.tolist() for light in start
+    ]
+    assert all("color" not in each for each in fitted.uncertainty)
+    assert "position" not in fitted.uncertainty[0]
+
+
+def test_failure_is_said():
+    with pytest.raises(RuntimeError, match=r"no fit in \d+ steps.*from [\de.-]+ to [\de.-]+"):
+        quietly(picture(), cache(), WRONG[0], max_steps=2)
+    fitted = quietly(picture(), cache(), WRONG[0], max_steps=2, throw=False)
+    assert not fitted.success
+    assert fitted.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert len(fitted.losses) == 3 and np.isfinite(fitted.losses).all()
+
+
+SUNS = (
+    AmbientLight([0.3, 0.2, 0.1]),
+    DirectionalLight([0.3, 0.5, 1.0], [1.0, 0.9, 0.7]),
+    DirectionalLight([-0.6, 0.1, 1.0], [0.2, 0.5, 1.5]),
+)
+
+
+def test_colors_alone_are_a_linear_problem():
+    """By NumPy's least squares, of a reference that no lights explain."""
+    rng = np.random.default_rng(0)
+    reference = rng.uniform(size=(SIZE, SIZE, 3))
+    masks = [None, rng.uniform(size=(SIZE, SIZE)), rng.integers(0, 2, (SIZE, SIZE)) * 1.0]
+    white = [type(light)(**vars(light) | {"color": WHITE}) for light in SUNS]
+    columns = np.stack(
+        [relight.shade(cache(), CAMERA, *each) for each in zip(white, masks, strict=True)]
+    )
+    fitted = colors_of(reference, cache(), SUNS, visibility=masks)
+    for c in range(3):
+        matrix, right = columns[..., c].reshape(3, -1).T, reference[..., c].ravel()
+        expected, squares, _, _ = np.linalg.lstsq(matrix, right, rcond=None)
+        np.testing.assert_allclose([each.color[c] for each in fitted.lights], expected)
+        variance = squares / (right.size - 3) * np.diag(np.linalg.inv(matrix.T @ matrix))
+        errors = [each["color"][c] for each in fitted.uncertainty]
+        # Theirs is from this channel alone, ours from all three.
+        np.testing.assert_allclose(errors, np.sqrt(variance), rtol=0.05)
+    loss = np.mean((np.asarray(fitted.image) - reference) ** 2)
+    assert len(fitted.losses) == 1
+    np.testing.assert_allclose(fitted.losses[0], loss, rtol=1e-6)
+
+
+def test_a_light_that_reaches_nothing():
+    lights = (*SUNS[:2], PointLight([0.0, 0.0, 9.0], WHITE))
+    fitted = colors_of(relight.render(cache(), CAMERA, SUNS), cache(), lights)
+    assert fitted.lights[2].color.tolist() == [0, 0, 0]
+    assert fitted.uncertainty[2]["color"].tolist() == [np.inf] * 3
+    assert np.isfinite(fitted.uncertainty[1]["color"]).all()
+    assert fitted.indistinct == ()
+
+
+SIDE = DirectionalLight([0.5, 0.0, 1.0], WHITE)
+DEPENDENT = {
+    "none": (cache, SUNS, ()),
+    "two suns": (cache, (*SUNS, SUNS[2]), ((2, 3),)),
+    "twins": (cache, (SUNS[2], SUNS[1], SUNS[2], SUNS[0], SUNS[1]), ((0, 2), (1, 4))),
+    "a wall": (wall, SUNS, ((0, 1, 2),)),
+    "a wall and a lamp": (wall, (SUNS[1], TRUTH[1], SIDE), ((0, 2),)),
+}
+
+
+@pytest.mark.parametrize(("made", "lights", "groups"), DEPENDENT.values(), ids=DEPENDENT)
+def test_lights_that_cannot_be_told_apart(made, lights, groups):
+    reference = relight.render(made(), CAMERA, lights)
+    fitted = colors_of(reference, made(), lights)
+    assert fitted.indistinct == groups
+    np.testing.assert_allclose(fitted.image, reference, rtol=1e-6, atol=1e-6)
+    # Of lights that are the same, each takes the same share.
+    for one, *others in groups if made is cache else ():
+        for other in others:
+            np.testing.assert_allclose(fitted.lights[one].color, fitted.lights[other].color)
+
+
+def test_suns_over_a_matt_hill_are_dependent_but_for_three():
+    """What is lit everywhere and has no highlight sees the sum of the suns alone."""
+    hill = cache()
+    normal = np.array([0.0, 0.0, -3.0]) + 0.5 * np.asarray(hill.normal)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    images = hill.ambient, hill.diffuse, hill.specular, normal, hill.depth, hill.roughness
+    hill = GBuffer(hill.color, np.zeros((SIZE, SIZE), int), *images)
+    directions = [(0.2, 0.1, 1), (-0.2, 0.1, 1), (0, -0.2, 1), (0.1, 0.3, 1)]
+    suns = tuple(DirectionalLight(each, WHITE) for each in directions)
+    reference = relight.render(hill, CAMERA, suns)
+    assert colors_of(reference, hill, suns[:3]).indistinct == ()
+    assert colors_of(reference, hill, suns).indistinct == ((0, 1, 2, 3),)
+
+
+def test_uncertainty_is_the_spread_over_draws_of_noise():
+    reference = relight.render(cache(), CAMERA, SUNS)
+    rng = np.random.default_rng(2)
+    misses = []
+    for _ in range(64):
+        fitted = colors_of(reference + rng.normal(0, 0.02, reference.shape), cache(), SUNS)
+        misses.append(
+            [
+                (light.color - true.color) / errors["color"]
+                for light, true, errors in zip(
+                    fitted.lights, SUNS, fitted.uncertainty, strict=True
+                )
+            ]
+        )
+    spread = np.std(misses, axis=0)
+    assert ((spread > 0.7) & (spread < 1.3)).all(), spread
+
+
+FAULTS = {
+    "lights(reference)": {"reference": np.zeros((SIZE, SIZE))},
+    "lights(reference) must hold floats": {"reference": np.zeros((SIZE, SIZE, 3), np.uint8)},
+    "lights(reference) must have the cache's shape": {"reference": np.zeros((SIZE, 9, 3))},
+    "lights(reference) must be finite": {"reference": np.full((SIZE, SIZE, 3), np.inf)},
+    "lights(gbuffer)": {"gbuffer": np.zeros((SIZE, SIZE))},
+    "lights(lights)": {"lights": ()},
+    "lights(lights[1])": {"lights": (*SUNS[:1], "sun")},
+    "lights(visibility=...) must have an entry": {"visibility": [None]},
+    "lights(visibility=...) must have shape": {"visibility": [None, None, np.ones((3, 3))]},
+    "lights(parameters=...)": {"parameters": ("colour",)},
+    "lights(parameters=...) must name some": {"parameters": ()},
+    "lights(parameters=...) must": {"parameters": ("angles",)},
+    "lights(rounds=...)": {"rounds": 0},
+    "lights(max_steps=...)": {"max_steps": 0.5},
+}
+
+
+@pytest.mark.parametrize(("message", "fault"), FAULTS.items(), ids=FAULTS)
+def test_bad_arguments_are_named(message, fault):
+    given = {"reference": picture(), "gbuffer": cache(), "lights": SUNS} | fault
+    call, _, rest = message.partition(" ")
+    with pytest.raises(ValueError, match=re.escape(f"`{call}` {rest}")):
+        inspect.unwrap(fit.lights)(camera=CAMERA, **given | {"progress": False})
+
+
+# A sun over boxes on a floor, by its shadow alone: straight from above, every visible face is
+# level, and so equally bright wherever the sun is.
+BOXES = np.array(
+    [
+        [[-3.0, -0.2, -3.0], [3.0, 0.0, 3.0]],
+        [[-0.15, 0.0, -0.15], [0.15, 1.2, 0.15]],
+        [[-1.2, 0.0, 0.3], [-0.7, 0.5, 1.0]],
+        [[0.6, 0.0, -1.1], [1.3, 0.3, -0.9]],
+    ]
+)
+DOWN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 5], [0, 1, 0, 0], [0, 0, 0, 1]])
+FLOOR_CAMERA = OrthographicCamera(2 * SIZE / 5, jnp.array([SIZE, SIZE], float), DOWN)
+UP = np.array([0.0, 1.0, 0.0])
+SUN = np.array([0.6, -1.0, 0.35]) / np.linalg.norm([0.6, -1.0, 0.35])
+MAP, SCALES = 160, (8.0, 16.0, 32.0, 64.0)
+
+
+def in_sun(points):
+    """Whether no box lies between a point and the sun, by slabs."""
+    clear = np.ones(points.shape[:-1], bool)
+    for low, high in BOXES:
+        one, other = (low - points) / -SUN, (high - points) / -SUN
+        enter, leave = np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
+        clear &= (leave < 1e-6) | (leave < enter)
+    return clear
+
+
+@functools.cache
+def boxes():
+    parts = [trimesh.creation.box(bounds=bounds) for bounds in BOXES]
+    return scene.from_trimesh(trimesh.util.concatenate(parts))
+
+
+def photograph():
+    """The boxes under a sun and a sky, with hard shadows."""
+    size = {"height": 2 * SIZE, "width": 2 * SIZE}
+    gbuffer = scene.gbuffer(boxes(), FLOOR_CAMERA, **size)
+    depth = jnp.asarray(gbuffer.depth, float)
+    points = FLOOR_CAMERA.unproject(pixel_centers(**size), depth)
+    clear = in_sun(np.asarray(points) + 1e-4 * UP).astype(float)
+    sky, sun = AmbientLight([0.2, 0.25, 0.3]), DirectionalLight(SUN, [2.0, 1.8, 1.5])
+    image = relight.shade(gbuffer, FLOOR_CAMERA, sky)
+    return gbuffer, image + relight.shade(gbuffer, FLOOR_CAMERA, sun, clear)
+
+
+def at_angle(angle, about):
+    """The sun's direction turned by an angle to one side."""
+    across = np.cross(SUN, UP) / np.linalg.norm(np.cross(SUN, UP))
+    side = np.cos(about) * across + np.sin(about) * np.cross(SUN, across)
+    return np.cos(angle) * SUN + np.sin(angle) * side
+
+
+def miss(light):
+    """Degrees between a light and the sun."""
+    return np.degrees(np.arccos(SUN @ light.direction / np.linalg.norm(light.direction)))
+
+
+@pytest.mark.parametrize("about", np.arange(4) * np.pi / 2 + 0.4)
+def test_a_sun_by_its_shadow(about):
+    gbuffer, image = photograph()
+    size = {"height": MAP, "width": MAP}
+
+    def shadows(lights, index):
+        """A finer map in each round, from the sun found so far."""
+        ahead = np.asarray(lights[1].direction)
+        look = PinholeCamera.look_at(-8 * ahead, np.zeros(3), up=[0, 1, 0], fov_y=1.0, **size)
+        centre = jnp.array([MAP / 2, MAP / 2])
+        camera = OrthographicCamera(SCALES[index], centre, look.world_from_camera)
+        depths = scene.depth(boxes(), camera, **size)
+        softness = 1 / SCALES[index]
+        moving = fit.MovingShadow(depths, camera, gbuffer, FLOOR_CAMERA, softness=softness)
+        return None, moving
+
+    start = AmbientLight(WHITE), DirectionalLight(at_angle(np.radians(15), about), WHITE)
+    assert miss(start[1]) == pytest.approx(15)
+    options = {"visibility": shadows, "rounds": len(SCALES), "progress": False}
+    fitted = fit.lights(image, gbuffer, FLOOR_CAMERA, start, **options)
+    assert fitted.success and fitted.indistinct == ()
+    assert miss(fitted.lights[1]) < 0.5
+    # Without shadows the sun can't be told from the sky, nor its height from its brightness.
+    plain = fit.lights(
+        image, gbuffer, FLOOR_CAMERA, start, parameters=("color",), progress=False
+    )
+    assert plain.indistinct == ((0, 1),)
