@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import clip01
+from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._discs import vogel
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof.gather import mix
@@ -65,7 +65,7 @@ def _blend(image, depth, lens, max_coc):
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
     kernel = taps_kernel(max_coc / 2 / math.sqrt(2))
     blur = _filter(_filter(image, kernel), kernel)
-    share = clip01(jnp.abs(view.defocus) / max_coc)
+    share = clip01(absolute(view.defocus) / max_coc)
     return mix(image, blur, share[..., None]).astype(dtype)
 
 

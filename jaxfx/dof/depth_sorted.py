@@ -79,7 +79,7 @@ def depth_sorted(
 def _depth_sorted(image, depth, lens, max_coc, slices):
     dtype = image.dtype
     image, defocus, bad = defocused(image, depth, lens, max_coc)
-    coc = jnp.abs(defocus)
+    coc = absolute(defocus)
     radius = jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
     value = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
     value = value / (jnp.pi * radius * radius)[..., None]

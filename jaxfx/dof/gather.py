@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, clip01, parameter
+from jaxfx._numerics import absolute, check, clip01, parameter
 from jaxfx._sampling import bilinear, pixel_centers
 from jaxfx.dof._discs import POISSON, vogel
 from jaxfx.dof._inputs import check_arguments, check_count, defocused
@@ -54,13 +54,15 @@ def gather(
       paper's own step, `D_tap >= D_q`.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    spoils what reads it: 0.8 `max_coc` and 8 pixels about it, at the most.
+    spoils what reads it: 0.8 `max_coc` + 10 pixels away along each axis, at the most.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
     a negative `softness`, a bad `taps`, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `softness` and every field of `lens`;
-    zero where a circle is clamped. With a `softness` of 0 that of the leak test is missing.
+    zero where a circle is clamped. On the focus plane, where taps leave the pixel's centre, the
+    slopes between pixels are those to the right and below. With a `softness` of 0 the
+    derivative of the leak test is missing.
 
     Source: Scheuermann 2004, advanced depth of field: the low-resolution picture, the taps, the
     scales and the leak test. Reconstructed: what bounds a picture whose sides are no multiples
@@ -86,7 +88,7 @@ def _gather(image, depth, lens, softness, max_coc, disc):
     # One read gives a tap's colour and its defocus.
     full = jnp.concatenate([image, view.defocus[..., None]], axis=-1)
     centre = view.defocus
-    radius = jnp.abs(centre)[..., None] / 2
+    radius = absolute(centre)[..., None] / 2
     points = pixel_centers(image.shape[0], image.shape[1], image.dtype)
     # On a surface of one depth a tap, which is interpolated, may round to in front.
     rounding = 8 * jnp.finfo(image.dtype).eps * max_coc
@@ -95,7 +97,7 @@ def _gather(image, depth, lens, softness, max_coc, disc):
         offset = offset[None, None] * radius
         high = bilinear(full, points + offset)
         tap, defocus = high[..., :-1], high[..., -1]
-        blur = jnp.abs(defocus) / max_coc
+        blur = absolute(defocus) / max_coc
         soft = bilinear(low, points / _SIDE + _LOW_RADIUS * offset)
         tap = mix(tap, soft, blur[..., None])
         behind = (defocus >= centre - rounding).astype(image.dtype)
@@ -115,8 +117,9 @@ def mix(
     other: Float[Array, "height width channel"],
     share: Float[Array, "height width 1"],
 ) -> Float[Array, "height width channel"]:
-    """`one` and a share of `other`, which is not looked at where its share is 0."""
-    return (1 - share) * one + share * jnp.where(share == 0, 0, other)
+    """`one` and a share of `other`; what is no number and has no share spoils nothing."""
+    outside = (share == 0) & ~jnp.isfinite(other)
+    return (1 - share) * one + share * jnp.where(outside, 0, other)
 
 
 def low_resolution(

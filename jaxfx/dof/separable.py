@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, parameter
+from jaxfx._numerics import absolute, check, parameter
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof._sprites import POINT_RADIUS, coverage, leak_rejection, reach
 from jaxfx.lens import FocusPlanes, ThinLens
@@ -73,7 +73,7 @@ def separable(
 @ft.partial(jax.jit, static_argnames=("max_coc",))
 def _separable(image, depth, lens, epsilon, max_coc):
     view = defocused(image, depth, lens, max_coc)
-    coc = jnp.abs(view.defocus)
+    coc = absolute(view.defocus)
     half = _HALF_SIDE * coc
     half = jnp.where(half < POINT_RADIUS, POINT_RADIUS, half)
     leak = jnp.where(view.defocus < 0, -1, coc)
