@@ -1,24 +1,32 @@
 """Speed against accuracy, measured in one run and drawn on one chart."""
 
+import io
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.core
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from tqdm.auto import tqdm
 
 from jaxfx import metrics
+from jaxfx.exr.layers import StrPath, write_whole
 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
-__all__ = ["Measurement", "measure", "pareto", "plot"]
+__all__ = ["Measurement", "measure", "pareto", "plot", "save"]
+
+Point = tuple[float, float]
 
 
 class Measurement(NamedTuple):
@@ -29,6 +37,8 @@ class Measurement(NamedTuple):
     - `spread`: seconds between the quickest and the slowest call.
     - `psnr`, `ssim`: against the reference, decibels and a ratio.
     - `band_psnr`: decibels inside the mask; NaN where none was given.
+    - `memory`: the largest memory in use beside the arguments and the picture, bytes; NaN where
+      it can't be known.
     """
 
     name: str
@@ -37,6 +47,7 @@ class Measurement(NamedTuple):
     psnr: float
     ssim: float
     band_psnr: float
+    memory: float = math.nan
 
 
 def measure(
@@ -46,6 +57,7 @@ def measure(
     mask: Bool[ArrayLike, "height width"] | None = None,
     repeats: int = 7,
     max_seconds: float = 2.0,
+    memory: bool = True,
     progress: bool = True,
 ) -> list[Measurement]:
     """Time and accuracy of every method, one after another in one process.
@@ -62,6 +74,9 @@ def measure(
     - `mask`: height width, the pixels that `band_psnr` is about; those near depth edges, say.
     - `repeats`: calls to time, a scalar count.
     - `max_seconds`: of timed calls for each method; a first call over it is the only one.
+    - `memory`: trace each method and compile it once more, to know its memory: that of the
+      program that `jax.jit` makes of it, what it closes over counted as arguments. A method
+      that can't be traced has none to know.
     - `progress`: show a bar on stderr.
 
     **Returns:** a list of `Measurement`, in the order of `methods`.
@@ -93,9 +108,26 @@ def measure(
                 float(metrics.psnr(image, reference)),
                 float(metrics.ssim(image, reference)),
                 float(band),
+                _temporary_bytes(method) if memory else math.nan,
             )
         )
     return measurements
+
+
+def _temporary_bytes(method: Callable[[], ArrayLike]) -> float:
+    """What one program of all that a method does holds beside its arguments and its picture."""
+    try:
+        closed = jax.make_jaxpr(method)()
+    except Exception:  # It has run before: tracing is what it can't bear.
+        return math.nan
+    if not closed.eqns:  # NumPy did it all.
+        return math.nan
+
+    def program(arrays: list[Array]) -> list[Array]:
+        return jax.core.eval_jaxpr(closed.jaxpr, arrays)
+
+    analysis = jax.jit(program).lower(closed.consts).compile().memory_analysis()
+    return math.nan if analysis is None else float(analysis.temp_size_in_bytes)
 
 
 def _timed(method: Callable[[], ArrayLike]) -> tuple[Array, float]:
@@ -129,40 +161,142 @@ def plot(
 ) -> None:
     """The chart: milliseconds, logarithmic, against PSNR, the Pareto front drawn through.
 
+    Every measurement is a point with its name beside it: filled on the front, hollow where it
+    is beaten. Names keep clear of one another and of the points, at the size that the figure
+    has now.
+
     **Arguments:**
 
     - `measurements`: what `measure` gave, a sequence of any length.
     - `ax`: the matplotlib axes to draw on.
-    - `lines`: from a label to the names to join by a line, one method at several settings.
+    - `lines`: from a label to the names to join by a line, one method at several settings. A
+      point is then named by what its name has after the label.
 
     **Gradient:** none: it draws.
     """
     by_name = {m.name: m for m in measurements}
-    joined = {name for names in (lines or {}).values() for name in names}
-
+    label_of = {name: label for label, names in (lines or {}).items() for name in names}
     front = pareto(measurements)
-    ax.step(
-        [1e3 * m.seconds for m in front],
-        [m.psnr for m in front],
-        where="post",
-        color="0.75",
-        linewidth=6,
-        solid_capstyle="round",
-        zorder=0,
-        label="Pareto front",
-    )
+    milliseconds, decibels = [1e3 * m.seconds for m in front], [m.psnr for m in front]
+    style = {"color": "0.85", "linewidth": 6, "solid_capstyle": "round", "zorder": 0}
+    ax.step(milliseconds, decibels, where="post", label="Pareto front", **style)
+
+    colors = {}
     for label, names in (lines or {}).items():
-        points = [by_name[name] for name in names]
-        milliseconds = [1e3 * m.seconds for m in points]
-        ax.plot(milliseconds, [m.psnr for m in points], "o-", markersize=4, label=label)
-        for name, x, point in zip(names, milliseconds, points, strict=True):
-            short = name.removeprefix(label).strip()
-            ax.annotate(short, (x, point.psnr), xytext=(4, -10), textcoords="offset points")
+        points = [(1e3 * by_name[name].seconds, by_name[name].psnr) for name in names]
+        (line,) = ax.plot(*zip(*points, strict=True), "-", linewidth=1, label=label)
+        colors[label] = line.get_color()
+    texts = []
     for m in measurements:
-        if m.name not in joined:
-            ax.errorbar(1e3 * m.seconds, m.psnr, xerr=1e3 * m.spread / 2, fmt="s", label=m.name)
+        color = colors.get(label_of.get(m.name), "0.15")
+        xy = 1e3 * m.seconds, m.psnr
+        ax.errorbar(
+            *xy,
+            xerr=1e3 * m.spread / 2,
+            fmt="o" if m.name in label_of else "s",
+            markersize=5,
+            color=color,
+            markerfacecolor=color if m in front else "white",
+        )
+        name = m.name.removeprefix(label_of.get(m.name, "")).strip()
+        texts.append((name, xy, color))
     ax.set_xscale("log")
     ax.set_xlabel("time of a picture (ms, median)")
     ax.set_ylabel("PSNR to the reference (dB)")
+    ax.margins(0.12)
     ax.grid(alpha=0.3)
-    ax.legend()
+    ax.legend(loc="lower right", fontsize="small")
+    _write_names(ax, texts)
+
+
+# The sides of a point that a name may stand on, the better ones first: a direction and how the
+# name is aligned to it.
+_SIDES = (
+    (1, 0, "left", "center"),
+    (0, 1, "center", "bottom"),
+    (0, -1, "center", "top"),
+    (-1, 0, "right", "center"),
+    (0.7, 0.7, "left", "bottom"),
+    (0.7, -0.7, "left", "top"),
+    (-0.7, 0.7, "right", "bottom"),
+    (-0.7, -0.7, "right", "top"),
+)
+# How far from it, in printer's points; from the third on, a hair line leads there.
+_DISTANCES = (6, 11, 18, 28, 40, 54, 70, 90, 115)
+
+
+def _write_names(ax: "Axes", texts: Sequence[tuple[str, Point, Any]]) -> None:
+    """A name beside each point: the first place where it covers nothing, else the least."""
+    from matplotlib.transforms import Bbox
+
+    figure = ax.get_figure(root=True)
+    if figure is None:
+        return
+    figure.draw_without_rendering()  # Until then, nothing has its place.
+    point = figure.dpi / 72
+    spots = [ax.transData.transform(xy) for _, xy, _ in texts]
+    legend = ax.get_legend()
+    taken = [Bbox([spot - 4 * point, spot + 4 * point]) for spot in spots]
+    taken += [legend.get_window_extent()] if legend else []
+
+    for (name, xy, color), spot in zip(texts, spots, strict=True):
+        note = ax.annotate(
+            name,
+            xy,
+            xytext=(0, 0),
+            textcoords="offset points",
+            fontsize="small",
+            color=color,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.4, "shrinkB": 3},
+        )
+        size = note.get_window_extent().size
+
+        def box(distance, side, spot=spot, size=size):
+            dx, dy, across, along = side
+            x, y = spot + distance * point * np.array([dx, dy])
+            left = x - size[0] * {"left": 0, "center": 0.5, "right": 1}[across]
+            low = y - size[1] * {"bottom": 0, "center": 0.5, "top": 1}[along]
+            return Bbox.from_bounds(left, low, *size)
+
+        def covered(place):
+            own = box(*place)
+            shared = [Bbox.intersection(own, other) for other in taken]
+            inside = Bbox.intersection(own, ax.bbox)
+            area = sum(b.width * b.height for b in shared if b)
+            return (
+                area + own.width * own.height - (inside.width * inside.height if inside else 0)
+            )
+
+        places = [(distance, side) for distance in _DISTANCES for side in _SIDES]
+        distance, side = min(places, key=lambda place: round(covered(place), 3))
+        note.set(position=distance * np.array(side[:2]), ha=side[2], va=side[3])
+        if note.arrow_patch is not None:
+            note.arrow_patch.set_visible(distance >= _DISTANCES[2])
+        taken.append(box(distance, side))
+
+
+def save(figure: "Figure", path: StrPath) -> None:
+    """Save a chart, whole or not at all, with its text as text: to be searched and edited.
+
+    **Arguments:**
+
+    - `figure`: the matplotlib figure.
+    - `path`: the file; its suffix says which kind: `.pdf` and `.svg` are vectors, with fonts
+      that publishers accept (TrueType, no Type 3); `.png` has 200 dots an inch.
+
+    **Raises:** `ValueError` for a suffix that matplotlib does not know; `OSError` where the
+    folder does not exist or can't be written.
+
+    **Gradient:** none: it writes a file.
+    """
+    import matplotlib
+
+    kind = Path(path).suffix.removeprefix(".")
+    known = figure.canvas.get_supported_filetypes()
+    if kind not in known:
+        raise ValueError(f"`save(path)` must end in one of {sorted(known)}, got {path!r}.")
+    stream = io.BytesIO()
+    fonts: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none"}
+    with matplotlib.rc_context(fonts):
+        figure.savefig(stream, format=kind, dpi=200)
+    write_whole(path, stream.getbuffer())
