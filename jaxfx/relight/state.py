@@ -70,7 +70,7 @@ def start(
         sums=nothing(surface),
         dtype=gbuffer.color.dtype,
     )
-    return empty._with_all(lights, visibilities)
+    return _with_all(empty, lights, visibilities)
 
 
 @final
@@ -132,12 +132,12 @@ class RelightState(eqx.Module):
         **Gradient:** as `shade`'s with respect to `light` and `visibility`; with respect to
         the state, exact: what the old light brought is taken out of the derivatives too.
         """
-        i = self._index("edit", i)
-        (light,), (visibility,) = self._check("edit", [light], [visibility])
+        i = _index(self, "edit", i)
+        (light,), (visibility,) = _check(self, "edit", [light], [visibility])
         lights, visible = list(self.lights), list(self.visibilities)
         lights[i], visible[i] = light, visibility
         both = (self.lights[i], light), (self.visibilities[i], visibility)
-        return self._changed(both, (-1.0, 1.0), lights, visible)
+        return _changed(self, both, (-1.0, 1.0), lights, visible)
 
     def add(
         self, light: Light, visibility: Float[ArrayLike, "height width"] | None = None
@@ -152,9 +152,9 @@ class RelightState(eqx.Module):
 
         **Gradient:** as `shade`'s with respect to `light` and `visibility`.
         """
-        one = self._check("add", [light], [visibility])
-        return self._changed(
-            one, (1.0,), [*self.lights, *one[0]], [*self.visibilities, *one[1]]
+        one = _check(self, "add", [light], [visibility])
+        return _changed(
+            self, one, (1.0,), [*self.lights, *one[0]], [*self.visibilities, *one[1]]
         )
 
     def remove(self, i: int) -> "RelightState":
@@ -168,10 +168,10 @@ class RelightState(eqx.Module):
 
         **Gradient:** exact, with respect to the state.
         """
-        i = self._index("remove", i)
+        i = _index(self, "remove", i)
         without = lambda values: [*values[:i], *values[i + 1 :]]
         one = (self.lights[i],), (self.visibilities[i],)
-        return self._changed(one, (-1.0,), without(self.lights), without(self.visibilities))
+        return _changed(self, one, (-1.0,), without(self.lights), without(self.visibilities))
 
     def paint(
         self,
@@ -209,7 +209,7 @@ class RelightState(eqx.Module):
             )
         where, state, surface = jnp.asarray(mask)[..., None], self, self.surface
         if color is not None:
-            new = jnp.where(where, self._vector("color", color), self.color)
+            new = jnp.where(where, _vector(self, "color", color), self.color)
             ratio = safe_divide(new, self.color)
             tinted = lambda was: jnp.where(
                 where, jnp.where(self.color == 0, new, was * ratio), was
@@ -220,12 +220,12 @@ class RelightState(eqx.Module):
             state = eqx.tree_at(lambda s: s.color, state, new)
         if diffuse is not None:
             surface = surface._replace(
-                diffuse=jnp.where(where, self._vector("diffuse", diffuse), surface.diffuse)
+                diffuse=jnp.where(where, _vector(self, "diffuse", diffuse), surface.diffuse)
             )
         if specular is not None:
             shiny = where & (surface.shader > 0)[..., None]
             surface = surface._replace(
-                specular=jnp.where(shiny, self._vector("specular", specular), surface.specular)
+                specular=jnp.where(shiny, _vector(self, "specular", specular), surface.specular)
             )
         state = eqx.tree_at(lambda s: s.surface, state, surface)
         if roughness is None:
@@ -233,65 +233,12 @@ class RelightState(eqx.Module):
         value = parameter("paint(roughness=...)", roughness).astype(self.color.dtype)
         sharper = jnp.where(where[..., 0], exponent(value), surface.exponent)
         surface = surface._replace(exponent=sharper)
-        return eqx.tree_at(
+        bare = eqx.tree_at(
             lambda s: (s.surface, s.sums, s.lights, s.visibilities),
             state,
             (surface, nothing(surface), (), ()),
-        )._with_all(self.lights, self.visibilities)
-
-    def _vector(self, name: str, value: Any) -> Float[Array, "1 1 3"]:
-        return parameter(f"paint({name}=...)", value, (3,)).astype(self.color.dtype)[None, None]
-
-    def _index(self, method: str, i: Any) -> int:
-        try:
-            index = operator.index(i)
-        except TypeError:
-            raise ValueError(f"`{method}(i)` must be a static integer, got {i!r}.") from None
-        if not 0 <= index < len(self.lights):
-            raise ValueError(f"`{method}(i)` must be in [0, {len(self.lights)}), got {index}.")
-        return index
-
-    def _check(
-        self, method: str, lights: Sequence[Any], visibility: Sequence[Any]
-    ) -> tuple[tuple[Light, ...], tuple[_Visibility | None, ...]]:
-        """Lights and visibilities in the type of the sums."""
-        dtype, shape = self.color.dtype, self.color.shape[:2]
-        for light in lights:
-            if not isinstance(light, Light):
-                kinds = ", ".join(kind.__name__ for kind in get_args(Light))
-                kind = type(light).__name__
-                raise ValueError(f"`{method}(light)` must be one of {kinds}, got {kind}.")
-        cast = lambda leaf: leaf.astype(dtype)
-        images = (
-            None
-            if image is None
-            else parameter(f"{method}(visibility)", image, shape).astype(dtype)
-            for image in visibility
         )
-        return tuple(jax.tree.map(cast, tuple(lights))), tuple(images)
-
-    def _with_all(self, lights: Sequence[Light], visibility: Sequence[Any]) -> "RelightState":
-        """The state with all of these lights more."""
-        all_of_them = self._check("start", lights, visibility)
-        return self._changed(all_of_them, (1.0,) * len(lights), *all_of_them)
-
-    def _changed(
-        self,
-        terms: tuple[tuple[Light, ...], tuple[_Visibility | None, ...]],
-        signs: tuple[float, ...],
-        lights: Sequence[Light],
-        visibility: Sequence[_Visibility | None],
-    ) -> "RelightState":
-        """The state with `terms` put in or taken out, which holds `lights` then."""
-        signs_array = jnp.asarray(signs, self.color.dtype)
-        return RelightState(
-            color=self.color,
-            surface=self.surface,
-            lights=tuple(lights),
-            visibilities=tuple(visibility),
-            sums=changed(self.surface, self.sums, *terms, signs_array),
-            dtype=self.dtype,
-        )
+        return _with_all(bare, self.lights, self.visibilities)
 
 
 def _check_lights(lights: Any) -> tuple[Light, ...]:
@@ -299,3 +246,67 @@ def _check_lights(lights: Any) -> tuple[Light, ...]:
         kind = type(lights).__name__
         raise ValueError(f"`start(lights)` must be a sequence of lights, got {kind}.")
     return tuple(lights)
+
+
+# Functions, for a call of a method costs equinox a look at every light.
+
+
+def _vector(state: RelightState, name: str, value: Any) -> Float[Array, "1 1 3"]:
+    return parameter(f"paint({name}=...)", value, (3,)).astype(state.color.dtype)[None, None]
+
+
+def _index(state: RelightState, method: str, i: Any) -> int:
+    try:
+        index = operator.index(i)
+    except TypeError:
+        raise ValueError(f"`{method}(i)` must be a static integer, got {i!r}.") from None
+    if not 0 <= index < len(state.lights):
+        raise ValueError(f"`{method}(i)` must be in [0, {len(state.lights)}), got {index}.")
+    return index
+
+
+def _check(
+    state: RelightState, method: str, lights: Sequence[Any], visibility: Sequence[Any]
+) -> tuple[tuple[Light, ...], tuple[_Visibility | None, ...]]:
+    """Lights and visibilities in the type of the sums."""
+    dtype, shape = state.color.dtype, state.color.shape[:2]
+    for light in lights:
+        if not isinstance(light, Light):
+            kinds = ", ".join(kind.__name__ for kind in get_args(Light))
+            kind = type(light).__name__
+            raise ValueError(f"`{method}(light)` must be one of {kinds}, got {kind}.")
+    cast = lambda leaf: leaf.astype(dtype)
+    images = (
+        None
+        if image is None
+        else parameter(f"{method}(visibility)", image, shape).astype(dtype)
+        for image in visibility
+    )
+    return tuple(jax.tree.map(cast, tuple(lights))), tuple(images)
+
+
+def _with_all(
+    state: RelightState, lights: Sequence[Light], visibility: Sequence[Any]
+) -> RelightState:
+    """The state with all of these lights more."""
+    all_of_them = _check(state, "start", lights, visibility)
+    return _changed(state, all_of_them, (1.0,) * len(lights), *all_of_them)
+
+
+def _changed(
+    state: RelightState,
+    terms: tuple[tuple[Light, ...], tuple[_Visibility | None, ...]],
+    signs: tuple[float, ...],
+    lights: Sequence[Light],
+    visibility: Sequence[_Visibility | None],
+) -> RelightState:
+    """The state with `terms` put in or taken out, which holds `lights` then."""
+    signs_array = jnp.asarray(signs, state.color.dtype)
+    return RelightState(
+        color=state.color,
+        surface=state.surface,
+        lights=tuple(lights),
+        visibilities=tuple(visibility),
+        sums=changed(state.surface, state.sums, *terms, signs_array),
+        dtype=state.dtype,
+    )

@@ -1,0 +1,335 @@
+"""A light moved and a camera turned, from four cached views of a mesh.
+
+Renders four deep frame buffers of a mesh. Then, without the mesh's surfaces, a spot light is
+moved along a path before a camera that stands still, each frame an edit of one light; and the
+camera is turned, each frame a cache synthesized from the four. Shadows come from a shadow map
+of each frame. Writes `relight.gif`, `sheet.png` and `report.json`, with the time of each frame.
+"""
+
+import argparse
+import json
+import logging
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from PIL import Image
+
+from jaxfx import PinholeCamera, SpotLight, exr, metrics, relight, reproject, scene, shadow
+from jaxfx.exr.layers import write_whole
+
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+# Where the four caches stand and how far the camera turns: radians about the target, and up.
+STATIONS = ((-0.2, 0.0), (0.2, 0.0), (0.0, 0.15), (0.0, -0.05))
+TURN = 0.15
+MAP_SIZE = 512
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
+    parser.add_argument("--size", type=int, default=480, help="height of the picture, pixels")
+    parser.add_argument("--frames", type=int, default=32, help="half of them for the light")
+    parser.add_argument(
+        "--depth",
+        choices=("mesh", "warp"),
+        default="mesh",
+        help="a new view's depth: rasterised, or warped from the caches' own",
+    )
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
+    arguments = parser.parse_args()
+    for name, least in (("size", 16), ("frames", 2)):
+        if getattr(arguments, name) < least:
+            parser.error(f"--{name} must be at least {least}, got {getattr(arguments, name)}")
+    return arguments
+
+
+class Stage(NamedTuple):
+    """The mesh, the camera to begin with, and what it looks at."""
+
+    mesh: scene.Scene
+    camera: PinholeCamera
+    target: np.ndarray
+    height: int
+    width: int
+
+    def turned(self, angle: float, rise: float) -> PinholeCamera:
+        """The camera moved about the target, as far from it as before."""
+        pose = np.asarray(self.camera.world_from_camera, np.float64)
+        offset = pose[:3, 3] - self.target
+        sine, cosine = np.sin(angle), np.cos(angle)
+        turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+        eye = turn @ offset
+        eye[1] += rise * np.linalg.norm(offset)
+        eye *= np.linalg.norm(offset) / np.linalg.norm(eye)
+        focal = float(self.camera.intrinsics[1, 1])
+        return PinholeCamera.look_at(
+            self.target + eye,
+            self.target,
+            up=[0, 1, 0],
+            fov_y=2 * np.arctan(self.height / 2 / focal),
+            height=self.height,
+            width=self.width,
+        )
+
+    def gbuffer(self, camera):
+        return scene.gbuffer(self.mesh, camera, height=self.height, width=self.width)
+
+    def depth(self, camera):
+        return scene.depth(self.mesh, camera, height=self.height, width=self.width)
+
+    def light(self, phase: float) -> SpotLight:
+        """A spot light on a circle above the target, phase 0 to 1."""
+        radius = float(
+            np.linalg.norm(np.asarray(self.camera.world_from_camera)[:3, 3] - self.target)
+        )
+        angle = 2 * np.pi * phase
+        offset = radius * np.array([0.45 * np.cos(angle), 0.55, 0.35 + 0.25 * np.sin(angle)])
+        strength = 2.2 * offset @ offset
+        color = strength * np.array([1.0, 0.9, 0.75])
+        return SpotLight(self.target + offset, -offset, color, 0.3, 0.55)
+
+
+def set_stage(path: Path | None, height: int) -> Stage:
+    """The mesh and its camera; a file that won't do ends the program."""
+    width = height * 4 // 3
+    try:
+        mesh = scene.still_life() if path is None else scene.load(path)
+        camera = scene.default_camera(mesh, height=height, width=width)
+        middle = mesh.centre if mesh.viewpoint is None else np.array(mesh.viewpoint.target)
+        stage = Stage(mesh, camera, middle, height, width)
+        stage.gbuffer(camera)
+    except (OSError, ValueError, RuntimeError) as error:
+        sys.exit(f"relight.py: error: {error}")
+    return stage
+
+
+def make_folder(folder: Path) -> Path:
+    """The folder, made if need be; said now rather than after the work."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        sys.exit(f"relight.py: error: --out must be a folder to write to: {error}")
+    return folder
+
+
+@jax.jit
+def warped_depth(gbuffers, cameras, target):
+    """What the caches' own depths say of a new view: the nearest surface that any of them has.
+
+    A cache's points in the world are warped as if they were its colours.
+    """
+    height, width = gbuffers[0].depth.shape
+    columns, rows = (jnp.arange(side, dtype=jnp.float32) + 0.5 for side in (width, height))
+    pixels = jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
+    nearest = jnp.full((height, width), jnp.inf, jnp.float32)
+    for gbuffer, camera in zip(gbuffers, cameras, strict=True):
+        known = jnp.isfinite(gbuffer.depth)
+        points = camera.unproject(pixels, jnp.where(known, gbuffer.depth, 1))
+        image = jnp.concatenate([points, known[..., None].astype(points.dtype)], axis=-1)
+        moved, alpha = reproject.warp(image, gbuffer.depth, camera, target)
+        depth = target.project(moved[..., :3])[1]
+        shown = (alpha > 0) & (moved[..., 3] > 0.999) & (depth > 0)
+        nearest = jnp.where(shown, jnp.minimum(nearest, depth), nearest)
+    return nearest
+
+
+def visibility(stage: Stage, gbuffer, camera, light: SpotLight):
+    """What the light reaches, by a filtered shadow map."""
+    away = np.asarray(light.direction)
+    light_camera = PinholeCamera.look_at(
+        light.position,
+        light.position + light.direction,
+        up=[0, 0, 1] if abs(away[1]) > 0.9 * np.linalg.norm(away) else [0, 1, 0],
+        fov_y=2 * float(light.outer_angle) + 0.02,
+        height=MAP_SIZE,
+        width=MAP_SIZE,
+    )
+    shadow_map = scene.depth(stage.mesh, light_camera, height=MAP_SIZE, width=MAP_SIZE)
+    return filtered(gbuffer, camera, shadow_map, light_camera, 2e-3 * stage.mesh.scale)
+
+
+@jax.jit
+def filtered(gbuffer, camera, shadow_map, light_camera, thin):
+    receivers = shadow.receivers(
+        gbuffer.depth, camera, light_camera, normal=gbuffer.normal, normal_offset=thin
+    )
+    return shadow.pcf(shadow_map, receivers, size=5, bias=thin)
+
+
+class Clock:
+    """The milliseconds of each step of a frame."""
+
+    def __init__(self):
+        self.steps = {}
+
+    def __call__(self, name, function):
+        started = time.perf_counter()
+        result = jax.block_until_ready(function())
+        self.steps[name] = 1e3 * (time.perf_counter() - started)
+        return result
+
+
+class Studio:
+    """Four caches, and the state of the view that is shown."""
+
+    def __init__(self, stage: Stage, depth: str):
+        self.stage, self.depth = stage, depth
+        self.cameras = [stage.turned(*station) for station in STATIONS]
+        self.caches = [stage.gbuffer(camera) for camera in self.cameras]
+        self.lights = scene.default_lights(stage.camera)
+        self.others = [*self.lights[1:]]  # The key light is the one that moves.
+
+    def view(self, camera, light, clock):
+        """A new view: its cache is synthesized, and every light shaded."""
+        stage = self.stage
+        if self.depth == "mesh":
+            depth = clock("depth", lambda: stage.depth(camera))
+        else:
+            depth = clock("depth", lambda: warped_depth(self.caches, self.cameras, camera))
+        found, coverage = clock(
+            "synthesize",
+            lambda: relight.synthesize(self.caches, self.cameras, camera, depth=depth),
+        )
+        self.camera = camera
+        self.gbuffer, holes = clock("fill", lambda: relight.fill_holes(found, coverage))
+        lit = clock("shadow", lambda: visibility(stage, self.gbuffer, camera, light))
+        lights, visible = [light, *self.others], [lit, *(None for _ in self.others)]
+        self.state = clock(
+            "shade",
+            lambda: relight.start(self.gbuffer, camera, lights, visibilities=visible),
+        )
+        return clock("image", lambda: self.state.image), int(holes)
+
+    def move(self, light, clock):
+        """The same view with the light elsewhere: one light is edited."""
+        lit = clock("shadow", lambda: visibility(self.stage, self.gbuffer, self.camera, light))
+        self.state = clock("edit", lambda: self.state.edit(0, light, lit))
+        return clock("image", lambda: self.state.image)
+
+
+def play(studio: Studio, frames: int) -> tuple[list, list]:
+    """Every frame's picture, and what is reported of it."""
+    stage, half = studio.stage, frames // 2
+    first = stage.light(0.0)
+    for _ in range(2):  # The second time nothing is left to compile.
+        studio.view(stage.turned(0.0, 0.02), first, Clock())
+        studio.move(first, Clock())
+    pictures, records = [], []
+    for frame in range(frames):
+        clock, kind = Clock(), "edit" if frame < half else "new view"
+        if frame < half:
+            light, holes = stage.light(frame / half), 0
+            image = studio.move(light, clock)
+        else:
+            phase = 2 * np.pi * (frame - half) / (frames - half)
+            camera = stage.turned(TURN * np.sin(phase), 0.02 + 0.03 * (1 - np.cos(phase)))
+            image, holes = studio.view(camera, first, clock)
+        pictures.append(np.asarray(image))
+        records.append(
+            {
+                "kind": kind,
+                "milliseconds": sum(clock.steps.values()),
+                "steps": clock.steps,
+                "holes": holes,
+                "psnr": psnr_to_fresh_cache(studio, image),
+            }
+        )
+    return pictures, records
+
+
+def psnr_to_fresh_cache(studio: Studio, image) -> float:
+    """Against the picture from the view's own cache, with the same lights and shadows."""
+    truth = studio.stage.gbuffer(studio.camera)
+    light = studio.state.lights[0]
+    lit = visibility(studio.stage, truth, studio.camera, light)
+    lights, visible = [light, *studio.others], [lit, *(None for _ in studio.others)]
+    fresh = relight.start(truth, studio.camera, lights, visibilities=visible).image
+    return float(metrics.psnr(image, fresh))
+
+
+def to_bytes(picture) -> np.ndarray:
+    return np.rint(255 * exr.srgb_from_linear(np.clip(picture, 0, 1))).astype(np.uint8)
+
+
+def write_gif(pictures, path: Path) -> None:
+    first, *rest = (
+        Image.fromarray(to_bytes(picture)).quantize(128, dither=Image.Dither.NONE)
+        for picture in pictures
+    )
+    first.save(path, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
+
+
+def write_sheet(pictures, records, path: Path) -> None:
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, 12).astype(int))
+    figure, axes = plt.subplots(3, 4, figsize=(12, 7.6), layout="constrained")
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, i in zip(axes.flat, chosen, strict=False):
+        record = records[i]
+        ax.imshow(to_bytes(pictures[i]))
+        ax.set_title(
+            f"{record['kind']}: {record['milliseconds']:.0f} ms, {record['psnr']:.0f} dB",
+            fontsize=9,
+        )
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def summary(records) -> dict:
+    """The median time of each kind of frame and of its steps."""
+    kinds = {}
+    for kind in dict.fromkeys(record["kind"] for record in records):
+        of_kind = [record for record in records if record["kind"] == kind]
+        median = lambda read, of_kind=of_kind: statistics.median(map(read, of_kind))
+        kinds[kind] = {
+            "milliseconds": median(lambda record: record["milliseconds"]),
+            "steps": {
+                step: median(lambda record, step=step: record["steps"][step])
+                for step in of_kind[0]["steps"]
+            },
+            "psnr": median(lambda record: record["psnr"]),
+        }
+    return kinds
+
+
+def main() -> None:
+    arguments = parse()
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("jaxfx").setLevel(logging.INFO)
+    out = make_folder(arguments.out)
+    studio = Studio(set_stage(arguments.scene, arguments.size), arguments.depth)
+    pictures, records = play(studio, arguments.frames)
+    write_gif(pictures, out / "relight.gif")
+    write_sheet(pictures, records, out / "sheet.png")
+    report = {
+        "size": [studio.stage.height, studio.stage.width],
+        "depth": arguments.depth,
+        "cores": os.cpu_count(),
+        "median": summary(records),
+        "frames": records,
+    }
+    write_whole(out / "report.json", json.dumps(report, indent=2).encode())
+    for kind, median in report["median"].items():
+        steps = ", ".join(f"{name} {value:.1f}" for name, value in median["steps"].items())
+        print(f"{kind:9}{median['milliseconds']:7.1f} ms ({steps}), {median['psnr']:.1f} dB")
+    print(f"pictures and report in {out}")
+
+
+if __name__ == "__main__":
+    main()
