@@ -1,0 +1,288 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # What made this picture?
+#
+# Every effect here is a differentiable function of its parameters, so a picture can be asked
+# for them: least squares between the effect's output and the picture. `fit.dof` asks for a
+# lens, as `examples/fit_lens.py` shows; `fit.lights`, here, for the lights.
+
+# %%
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import trimesh
+
+from jaxfx import (
+    AmbientLight,
+    DirectionalLight,
+    GBuffer,
+    OrthographicCamera,
+    PinholeCamera,
+    PointLight,
+    SpotLight,
+    exr,
+    fit,
+    relight,
+    scene,
+    shadow,
+)
+
+
+plt.rcParams["figure.dpi"] = 80
+SIZE = {"height": 72, "width": 96}
+room = scene.still_life()
+camera = scene.default_camera(room, **SIZE)
+gbuffer = scene.gbuffer(room, camera, **SIZE)
+
+
+def show(**pictures):
+    _, axes = plt.subplots(
+        1, len(pictures), figsize=(4 * len(pictures), 3.2), layout="constrained"
+    )
+    for axis, (name, image) in zip(axes, pictures.items(), strict=True):
+        axis.imshow(np.clip(exr.srgb_from_linear(np.asarray(image)), 0, 1))
+        axis.set(title=name.replace("_", " "), xticks=[], yticks=[])
+    plt.show()
+
+
+# %% [markdown]
+# ## Three lights
+#
+# A picture under lights $i$ of colour $c_i$ and geometry $\theta_i$ is $I = \sum_i c_i\,
+# B_i(\theta_i)$: linear in the colours. So the colours are never searched. For any geometry
+# the best are the solution of a small linear system, and Levenberg-Marquardt walks over the
+# geometry alone:
+#
+# $$\min_\theta \big\lVert \sum_i c_i^\star(\theta)\, B_i(\theta_i) - I_{ref} \big\rVert^2,
+# \qquad
+# c^\star(\theta) = \arg\min_c \big\lVert \sum_i c_i B_i(\theta_i) - I_{ref} \big\rVert^2.$$
+
+# %%
+white = jnp.ones(3)
+truth = [
+    DirectionalLight([0.4, -1.0, -0.6], [0.5, 0.45, 0.35]),
+    PointLight([-0.8, 1.2, -2.0], [0.2, 0.4, 0.9]),
+    SpotLight([1.2, 2.2, -2.2], [-0.4, -1.0, -0.5], [2.5, 1.6, 0.8], 0.2, 0.5),
+]
+start = [
+    DirectionalLight([0.1, -1.0, -0.9], white),
+    PointLight([-0.5, 1.5, -2.4], white),
+    SpotLight([1.0, 2.5, -2.0], [-0.2, -1.0, -0.6], white, 0.3, 0.7),
+]
+reference = relight.render(gbuffer, camera, truth)
+fitted = fit.lights(reference, gbuffer, camera, start, progress=False)
+show(
+    reference=reference,
+    start=0.3 * relight.render(gbuffer, camera, start),
+    fitted=fitted.image,
+)
+
+# %%
+for found, true in zip(fitted.lights, truth, strict=True):
+    print(type(found).__name__)
+    for name in vars(true):
+        value, wanted = (np.asarray(getattr(light, name)) for light in (found, true))
+        if name == "direction":
+            wanted = wanted / np.linalg.norm(wanted)
+        print(f"  {name:12} {np.round(value, 3)!s:24} of {np.round(wanted, 3)}")
+print(f"{len(fitted.losses)} losses, from {fitted.losses[0]:.1e} to {fitted.losses[-1]:.1e}")
+
+# %% [markdown]
+# Some lights can't be told apart, whatever the search does. On a wall that is matt and flat,
+# every sun is the same as every other, and as the sky. `indistinct` names such groups: lights
+# whose parameters can change together without the picture changing.
+
+# %%
+suns = [truth[0], AmbientLight(white), truth[0]]
+picture = relight.render(gbuffer, camera, suns)
+print(
+    fit.lights(picture, gbuffer, camera, suns, parameters=("color",), progress=False).indistinct
+)
+
+# %% [markdown]
+# ## A sun by its shadow
+#
+# A photograph with hard shadows. Where is the sun? The answer lies in the shadows' edges, and
+# a hard shadow has no derivative: whether a point is lit is a step. First the plainest case,
+# boxes seen straight from above. All that is seen is level, so nothing but the shadows tells.
+
+
+# %%
+class View(NamedTuple):
+    """A scene and what a camera sees of it; `middle` is where the things are."""
+
+    world: scene.Scene
+    gbuffer: GBuffer
+    camera: PinholeCamera | OrthographicCamera
+    middle: tuple[float, float, float]
+
+
+def sun_camera(direction, middle, scale, size):
+    """The view along the sun's rays."""
+    ahead, middle = direction / jnp.linalg.norm(direction), jnp.array(middle)
+    pose = PinholeCamera.look_at(
+        middle - 9 * ahead, middle, up=[0, 1, 0], fov_y=1.0, height=size, width=size
+    ).world_from_camera
+    return OrthographicCamera(scale, jnp.array([size / 2, size / 2]), pose)
+
+
+def hard(view, direction, size=512, scale=100.0):
+    """The shadow by a fine map and a comparison."""
+    light_camera = sun_camera(direction, view.middle, scale, size)
+    depths = scene.depth(view.world, light_camera, height=size, width=size)
+    places = shadow.receivers(view.gbuffer.depth, view.camera, light_camera)
+    return shadow.hard(depths, places, bias=0.01, slope_bias=1.0)
+
+
+def soft(view, direction, scale, size=256):
+    """The shadow whose texels move with the light, as wide as nine of them."""
+    light_camera = sun_camera(direction, view.middle, scale, size)
+    depths = scene.depth(view.world, light_camera, height=size, width=size)
+    return fit.MovingShadow(depths, light_camera, view.gbuffer, view.camera, softness=1 / scale)
+
+
+def photograph(view, sun):
+    """Under a sky and a sun with hard shadows."""
+    dim, visible = AmbientLight([0.12, 0.15, 0.2]), hard(view, sun.direction, size=1024)
+    return relight.shade(view.gbuffer, view.camera, dim) + relight.shade(
+        view.gbuffer, view.camera, sun, visible
+    )
+
+
+corners = [
+    [[-4, -0.2, -4], [4, 0, 4]],
+    [[-0.1, 0, -0.1], [0.1, 1.4, 0.1]],
+    [[-1.2, 0, 0.3], [-0.7, 0.5, 1.0]],
+    [[0.6, 0, -1.1], [1.3, 0.3, -0.9]],
+]
+boxes = [trimesh.creation.box(bounds=each) for each in corners]
+boxes = scene.from_trimesh(trimesh.util.concatenate(boxes))
+down = np.array([[1.0, 0, 0, 0], [0, 0, -1, 5], [0, 1, 0, 0], [0, 0, 0, 1]])
+above = OrthographicCamera(16.0, jnp.array([48.0, 36.0]), down)
+table = View(boxes, scene.gbuffer(boxes, above, **SIZE), above, (0.0, 0.3, 0.0))
+
+sun = DirectionalLight([0.75, -1.0, -0.55], [1.0, 0.9, 0.7])
+target = photograph(table, sun)
+wide, narrow = (soft(table, sun.direction, scale)(sun) for scale in (10.0, 40.0))
+show(
+    photograph=target,
+    soft_at_10_texels_a_unit=jnp.tile(wide[..., None], (1, 1, 3)),
+    soft_at_40_texels_a_unit=jnp.tile(narrow[..., None], (1, 1, 3)),
+)
+
+# %% [markdown]
+# The loss as the sun turns about the vertical, the best colours taken at each angle. From
+# afar all look alike, and flatten where shadows no longer meet. Looked at closely, the hard
+# shadow's is a staircase: pixels switch, and between two switches the slope is 0, which is
+# all that a gradient sees. The soft shadow's has a slope, and the right one.
+
+
+# %%
+def turned(angle):
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return jnp.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ sun.direction
+
+
+def loss(angle, visibility):
+    lights = [AmbientLight(white), DirectionalLight(turned(angle), white)]
+    parts = [
+        relight.shade(table.gbuffer, table.camera, light, visible)
+        for light, visible in zip(lights, (None, visibility), strict=True)
+    ]
+    matrix = np.stack(parts, axis=-1).reshape(-1, 3, 2).astype(float)
+    right = np.asarray(target, float).reshape(-1, 3)
+    miss = [
+        right[:, c] - matrix[:, c] @ np.linalg.lstsq(matrix[:, c], right[:, c])[0]
+        for c in range(3)
+    ]
+    return np.mean(np.square(miss))
+
+
+def plot(axis, angles, **kinds):
+    for name, visible in kinds.items():
+        losses = [loss(angle, visible(angle)) for angle in angles]
+        axis.plot(angles, losses, ".-", label=name.replace("_", " "))
+    axis.set(xlabel="degrees off the sun", ylabel="mean squared residual")
+    axis.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
+    axis.legend()
+
+
+def seen(angle):
+    return DirectionalLight(turned(angle), white)
+
+
+_, (far, near) = plt.subplots(1, 2, figsize=(12, 3.8), layout="constrained")
+plot(
+    far,
+    np.linspace(-40, 40, 17),
+    hard=lambda angle: hard(table, turned(angle)),
+    soft_at_10=lambda angle: soft(table, turned(angle), 10.0)(seen(angle)),
+    soft_at_40=lambda angle: soft(table, turned(angle), 40.0)(seen(angle)),
+)
+once = soft(table, turned(2.0), 40.0)
+plot(
+    near,
+    np.linspace(1.85, 2.15, 21),
+    hard=lambda angle: hard(table, turned(angle)),
+    soft_at_40_map_made_once=lambda angle: once(seen(angle)),
+)
+plt.show()
+
+# %% [markdown]
+# So the search begins with a coarse map, whose kernel is as wide as the shadow is wrong, and
+# renders a finer one from where it got to, round by round. Within a round the map stays, but
+# its texels do not: each is a point of an occluder in the world, and moves its shadow with
+# the light. Here is the room again, under a sun that starts 17 degrees off.
+
+# %%
+scales = (10.0, 20.0, 40.0)
+still = View(room, gbuffer, camera, (0.0, 0.5, -3.0))
+target = photograph(still, sun)
+tilt = jnp.array([[0.966, 0.259, 0], [-0.259, 0.966, 0], [0, 0, 1]])
+wrong = DirectionalLight(tilt @ turned(8.0), sun.color)
+
+
+def degrees_off(light):
+    one, other = (each.direction / jnp.linalg.norm(each.direction) for each in (light, sun))
+    return float(jnp.degrees(jnp.arccos(one @ other)))
+
+
+def shadows(lights, index):
+    print(f"round {index}: {degrees_off(lights[1]):.2f} degrees off")
+    return None, soft(still, lights[1].direction, scales[index])
+
+
+fitted = fit.lights(
+    target,
+    gbuffer,
+    camera,
+    [AmbientLight(white), wrong],
+    visibility=shadows,
+    rounds=len(scales),
+    progress=False,
+)
+print(f"in the end: {degrees_off(fitted.lights[1]):.2f} degrees off")
+show(photograph=target, start=photograph(still, wrong), fitted=fitted.image)
+
+# %% [markdown]
+# ## What it can't do
+#
+# - Find a minimum far away: every search here is local. A sun 40 degrees off, or a light that
+#   starts where it lights nothing, stays lost.
+# - See an occluder that its light did not see: the first of two things behind one another
+#   hides the second until the map is rendered again.
+# - Know how many lights there are, or that a colour can't be negative: it takes what it is
+#   given and says in `indistinct` and `uncertainty` what the picture could not tell.
