@@ -5,6 +5,7 @@ from jaxfx.dof.blend import blend
 from jaxfx.dof.depth_sorted import depth_sorted
 from jaxfx.dof.diffusion import anisotropic_diffusion, implicit_diffusion
 from jaxfx.dof.gather import gather
+from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
 from jaxfx.dof.separable import separable
 
@@ -17,6 +18,7 @@ __all__ = [
     "depth_sorted",
     "gather",
     "implicit_diffusion",
+    "layered",
     "scatter",
     "separable",
 ]
