@@ -18,6 +18,8 @@ from jaxfx.lens import FocusPlanes, ThinLens
 _HALF_SIDE = math.sqrt(3) / 4
 # An epsilon below this is this.
 _SMALLEST_EPSILON = 1e-6
+# Rows that are passed over at once: what a tap reads and adds to then stays in the cache.
+_BAND = 16
 
 
 def separable(
@@ -80,11 +82,35 @@ def _separable(image, depth, lens, epsilon, max_coc):
     epsilon = jnp.maximum(epsilon.astype(coc.dtype), _SMALLEST_EPSILON)
     far = reach(2 * _HALF_SIDE * max_coc)
 
-    picture = jnp.where(view.bad[..., None], jnp.nan, view.image)
-    picture = jnp.moveaxis(picture, -1, 0)
-    picture = _along_rows(picture, half, leak, coc, epsilon, far)
-    turned = _along_rows(picture.swapaxes(1, 2), half.T, leak.T, coc.T, epsilon, far)
-    return jnp.transpose(turned, (2, 1, 0)).astype(image.dtype)
+    picture = jnp.moveaxis(jnp.where(view.bad[..., None], jnp.nan, view.image), -1, 0)
+    planes = picture, half, leak, coc
+    for _ in range(2):
+        # Turned over after each pass: the second is along columns.
+        picture = _in_bands(planes, epsilon, far)
+        planes = tuple(plane.swapaxes(-1, -2) for plane in (picture, *planes[1:]))
+    return jnp.moveaxis(planes[0], 0, -1).astype(image.dtype)
+
+
+def _in_bands(
+    planes: tuple[Float[Array, "..."], ...], epsilon: Float[Array, ""], far: int
+) -> Float[Array, "channel height width"]:
+    """One pass, a band of rows after another."""
+    height = planes[1].shape[0]
+    band = min(_BAND, height)
+
+    def split(plane):
+        margins = [(0, 0)] * (plane.ndim - 2) + [(0, -height % band), (0, 0)]
+        plane = jnp.pad(plane, margins, mode="edge")
+        shape = (*plane.shape[:-2], -1, band, plane.shape[-1])
+        return jnp.moveaxis(plane.reshape(shape), -3, 0)
+
+    def one(bands):
+        picture, half, leak, coc = bands
+        return _along_rows(picture, half, leak, coc, epsilon, far)
+
+    passed = jax.lax.map(one, tuple(split(plane) for plane in planes))
+    channels, width = planes[0].shape[0], planes[0].shape[-1]
+    return jnp.moveaxis(passed, 0, 1).reshape(channels, -1, width)[:, :height]
 
 
 def _along_rows(
