@@ -37,7 +37,8 @@ def gaussian(
     A pixel becomes the mean of its neighbours, weighted by w_i w_j at an offset of (i, j)
     pixels; beyond the border the nearest pixel is repeated. The weights are binomial ones, or
     those of `exp(-i**2 / (2 sigma**2))`, and sum to 1. Variances add: n passes of k taps reach
-    as far as one of n (k - 1) + 1 taps, for n k reads along each axis.
+    as far as one of n (k - 1) + 1 taps, for n k reads along each axis. On a CPU, several passes
+    are quicker than one of more than 15 taps.
 
     **Arguments:**
 

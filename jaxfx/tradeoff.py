@@ -189,23 +189,23 @@ def plot(
     texts = []
     for m in measurements:
         color = colors.get(label_of.get(m.name), "0.15")
-        xy = 1e3 * m.seconds, m.psnr
+        xy, half = (1e3 * m.seconds, m.psnr), 1e3 * m.spread / 2
         ax.errorbar(
             *xy,
-            xerr=1e3 * m.spread / 2,
+            xerr=half,
             fmt="o" if m.name in label_of else "s",
             markersize=5,
             color=color,
             markerfacecolor=color if m in front else "white",
         )
         name = m.name.removeprefix(label_of.get(m.name, "")).strip()
-        texts.append((name, xy, color))
+        texts.append((name, xy, half, color))
     ax.set_xscale("log")
     ax.set_xlabel("time of a picture (ms, median)")
     ax.set_ylabel("PSNR to the reference (dB)")
     ax.margins(0.12)
     ax.grid(alpha=0.3)
-    ax.legend(loc="lower right", fontsize="small")
+    ax.legend(fontsize="small")
     _write_names(ax, texts)
 
 
@@ -225,7 +225,7 @@ _SIDES = (
 _DISTANCES = (6, 11, 18, 28, 40, 54, 70, 90, 115)
 
 
-def _write_names(ax: "Axes", texts: Sequence[tuple[str, Point, Any]]) -> None:
+def _write_names(ax: "Axes", texts: Sequence[tuple[str, Point, float, Any]]) -> None:
     """A name beside each point: the first place where it covers nothing, else the least."""
     from matplotlib.transforms import Bbox
 
@@ -234,12 +234,15 @@ def _write_names(ax: "Axes", texts: Sequence[tuple[str, Point, Any]]) -> None:
         return
     figure.draw_without_rendering()  # Until then, nothing has its place.
     point = figure.dpi / 72
-    spots = [ax.transData.transform(xy) for _, xy, _ in texts]
+    spots = [ax.transData.transform(xy) for _, xy, _, _ in texts]
     legend = ax.get_legend()
     taken = [Bbox([spot - 4 * point, spot + 4 * point]) for spot in spots]
+    for _, (x, y), half, _ in texts:
+        ends = ax.transData.transform([(max(x - half, ax.get_xlim()[0]), y), (x + half, y)])
+        taken.append(Bbox([ends[0] - [0, point], ends[1] + [0, point]]))
     taken += [legend.get_window_extent()] if legend else []
 
-    for (name, xy, color), spot in zip(texts, spots, strict=True):
+    for (name, xy, _, color), spot in zip(texts, spots, strict=True):
         note = ax.annotate(
             name,
             xy,
