@@ -1,0 +1,286 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Depth of field, by every method
+#
+# One picture, its depth and a lens go in: `(image, depth, lens, *, max_coc)`. All methods
+# take the diameter $C$ of a pixel's circle of confusion from the lens, $C = E f\,|1/Z_f -
+# 1/Z|$, and differ in who spreads what over whom. The reference is the mean of 128 pictures
+# of the scene itself, from all over the lens.
+
+# %%
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+
+from jaxfx import ThinLens, dof, exr, metrics, relight, scene, tradeoff
+
+
+sys.path.append("../tests/benchmarks")
+import dof_cases
+
+
+plt.rcParams["figure.dpi"] = 80
+set_matplotlib_formats("jpeg", pil_kwargs={"quality": 85})
+SIDE, LARGEST, FOCUS, SAMPLES = 192, 16.0, 2.8, 128
+
+room = scene.still_life()
+camera = scene.default_camera(room, height=SIDE, width=SIDE)
+lights = scene.default_lights(camera)
+depth = scene.depth(room, camera, height=SIDE, width=SIDE)
+unit = ThinLens.from_camera(camera, aperture=1.0, focus_distance=FOCUS)
+lens = ThinLens(LARGEST / jnp.max(unit.circle_of_confusion(depth)), FOCUS, unit.focal_pixels)
+
+
+def render(eye):
+    return relight.render(scene.gbuffer(room, eye, height=SIDE, width=SIDE), eye, lights)
+
+
+def passes(aperture, samples):
+    eye = ThinLens(aperture, FOCUS, unit.focal_pixels)
+    return dof.accumulate(render, camera, eye, samples=samples, progress=False)
+
+
+reference, convergence = passes(lens.aperture, SAMPLES)
+image, _ = passes(0.0, 16)  # a pinhole picture, antialiased as the reference is
+print(f"the reference's own error is about {float(convergence):.4f}")
+
+
+# %%
+def program(method):
+    blurred = jax.jit(lambda image, depth: method(image, depth, lens, max_coc=LARGEST))
+    return lambda: blurred(image, depth)
+
+
+methods = {name: program(method) for name, method in dof_cases.methods().items()}
+pictures = {"pinhole": image, "reference": reference}
+pictures |= {name: method() for name, method in methods.items()}
+
+
+def show(pictures, columns, size):
+    rows = -(-len(pictures) // columns)
+    _, axes = plt.subplots(
+        rows, columns, figsize=(size * columns, (size + 0.3) * rows), layout="constrained"
+    )
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
+        screen = exr.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
+        ax.imshow(screen, interpolation="nearest")
+        ax.set_title(title, fontsize=9)
+    plt.show()
+
+
+show(pictures, columns=5, size=2.3)
+
+# %% [markdown]
+# Nearer: the rods before the focus, whose blur should let the room shine through.
+
+# %%
+crop = (slice(16, 88), slice(10, 82))
+show({name: picture[crop] for name, picture in pictures.items()}, columns=5, size=2.3)
+
+# %% [markdown]
+# What each computes, of the pixel $q$:
+#
+# - `scatter` spreads every pixel $p$ over a disc: the mean of all $p$ under $K\,a_p$, with
+#   $a_p$ the share of the disc that falls on $q$, $K = (Z_f/Z_p)^\gamma$ in front of the
+#   focus, and 0 for background that would leak into what is in focus.
+# - `depth_sorted` takes the same sprites front to back, the mean under $v_p =
+#   \mathrm{clamp}(1 - \sum_{\text{nearer}} a,\; 0,\; a_p)$.
+# - `layered` sorts the same sprites at every $q$ into those in front of its surface, on it and
+#   behind it, and composites the three sums.
+# - `separable` has sprites on a line, along rows and then along columns: a square for a disc.
+# - `gather` reads 8 taps on $q$'s own circle, each mixed with a quarter-resolution picture by
+#   its blurriness; one in front of $q$ counts by its blurriness.
+# - `blend` is $\mathrm{lerp}(I, B, C/C_{\max})$, with $B$ two blurs of 13 taps.
+# - `anisotropic_diffusion` is $\partial I/\partial t = \nabla\!\cdot(g\,\nabla I)$ with $g =
+#   \min(C_p, C_q)^2/32 \;/\; (1 + (\Delta D/\text{edge})^2)$, in the fewest stable steps.
+# - `implicit_diffusion` solves $u - \partial_x(g\,\partial_x u) = I$, then $v -
+#   \partial_y(g\,\partial_y v) = u$: two tridiagonal systems.
+#
+# ## Speed against accuracy
+#
+# Time of a picture at this size against PSNR to the reference; beside it the PSNR in the band
+# of one largest radius about the edges in depth, where methods differ most. What a method
+# does with the pinhole picture is all that is timed.
+
+# %%
+inverse = 1 / jnp.asarray(depth)
+
+
+def largest(x, side):
+    return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (side, side), (1, 1), "SAME")
+
+
+jump = largest(inverse, 3) > -1.05 * largest(-inverse, 3)
+band = largest(jump.astype(jnp.float32), int(LARGEST) + 1) > 0
+
+measurements = tradeoff.measure(
+    methods, reference, mask=band, repeats=5, max_seconds=1.0, memory=False, progress=False
+)
+set_matplotlib_formats("png")
+figure, ax = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
+tradeoff.plot(measurements, ax)
+ax.set_title(f"{SIDE} x {SIDE}, circles up to {LARGEST:.0f} pixels, on this machine's CPU")
+plt.show()
+for m in sorted(measurements, key=lambda m: -m.psnr):
+    print(
+        f"{m.name:22} {1e3 * m.seconds:8.1f} ms  {m.psnr:6.2f} dB"
+        f"  {m.band_psnr:6.2f} dB in the band  SSIM {m.ssim:.3f}"
+    )
+print(f"{'pinhole':22} {'':8}     {float(metrics.psnr(image, reference)):6.2f} dB")
+
+# %% [markdown]
+# Two facts to take away. Two passes along lines lose a few tenths of a decibel to discs, unless
+# a highlight shows their square, and their time grows with the radius in place of its square.
+# And taps are cheap on a GPU, which reads between pixels for nothing; here every one of them is
+# four reads, so gathering is neither fast nor good.
+#
+# The implicit flow does the same work at any radius:
+
+# %%
+radii, line = (4, 8, 16, 32, 64), {}
+for name in ("implicit_diffusion", "separable"):
+    method = getattr(dof, name)
+    blur = lambda image, depth, aperture, size, method=method: method(
+        image, depth, ThinLens(aperture, FOCUS, unit.focal_pixels), max_coc=2 * size
+    )
+    blur = jax.jit(blur, static_argnames="size")
+    wide = {
+        r: lambda r=r, blur=blur: blur(image, depth, lens.aperture * 2 * r / LARGEST, r)
+        for r in radii
+    }
+    for run in wide.values():
+        jax.block_until_ready(run())
+    timed = tradeoff.measure(wide, reference, repeats=5, memory=False, progress=False)
+    line[name] = [1e3 * m.seconds for m in timed]
+
+figure, ax = plt.subplots(figsize=(6, 3), layout="constrained")
+for name, times in line.items():
+    ax.plot(radii, times, "o-", label=name)
+ax.set_xscale("log", base=2)
+ax.set(ylim=(0, None), xlabel="largest radius (pixels)", ylabel="time (ms)")
+ax.set_xticks(radii, radii)
+ax.legend()
+ax.grid(alpha=0.3)
+plt.show()
+
+# %% [markdown]
+# ## Where they fail
+#
+# Every method on the same cases, each with a truth in closed form: `tests/dof/failures.json`,
+# which the tests hold every method to. Red is worse than what a case asks for, the first row;
+# the empty ones don't apply.
+#
+# - *constant*: largest error on a constant picture over any depth.
+# - *slanted plane*: an opaque plane through focus; rms error.
+# - *energy*, *centroid*, *second moment*: of the picture of a point, a disc of radius 4.5.
+# - *jump*: as the radius goes from 0 to 2 pixels, the largest change of a step over that of one
+#   twice as long: a half for a slope, 1 for a jump. *unevenness*: over the mean change.
+# - *blurred foreground*, *sharp foreground*: rms error in the band about an edge.
+# - *thin bar*: bars of 1 to 3 pixels in focus before a bright field; rms error about them.
+# - *highlight*: relative error of dim pixels near one of 1e6, in float32.
+# - *reach of a NaN*: how far a bad pixel spoils others, with a radius of 6.
+# - *gradient*: how far derivatives lie outside both one-sided difference quotients.
+# - *not finite*: values that are, for depths of 0, 1e-30 and 1e30.
+
+# %%
+published = json.loads(Path("../tests/dof/failures.json").read_text())
+table = {"passes up to": dof_cases.PASSES} | published
+cells, colors = [], []
+for name, row in table.items():
+    figures = [row.get(case) for case in dof_cases.PASSES]
+    limits = dof_cases.PASSES.values()
+    cells.append(["" if f is None else f"{f:.2g}" for f in figures])
+    is_wrong = [f is not None and f > limit for f, limit in zip(figures, limits, strict=True)]
+    right = "0.92" if name == "passes up to" else "#e3f1e3"
+    shades = zip(figures, is_wrong, strict=True)
+    colors.append(["#f6c6c0" if w else "white" if f is None else right for f, w in shades])
+
+figure, ax = plt.subplots(figsize=(13, 0.32 * len(table) + 0.6), layout="constrained")
+ax.set_axis_off()
+drawn = ax.table(
+    cells,
+    cellColours=colors,
+    rowLabels=list(table),
+    colLabels=[case.replace(" ", "\n", 1) for case in dof_cases.PASSES],
+    loc="center",
+    cellLoc="center",
+)
+drawn.auto_set_font_size(False)
+drawn.set_fontsize(9)
+drawn.scale(1, 1.3)
+for (row, _), cell in drawn.get_celld().items():
+    if row == 0:
+        cell.set_height(cell.get_height() * 1.8)
+plt.show()
+
+# %% [markdown]
+# The cases with something to see, 46 pixels wide: a white half-plane before a black one, both
+# ways; a dim bar of 3 pixels before a bright field; a slanted plane. The last row is the
+# multi-pass reference, the line below each picture its middle row, over the truth.
+
+# %%
+cases = {name: several[-1] for name, several in dof_cases.scenes().items()}
+names = [*dof_cases.methods(), "accumulate"]
+figure, axes = plt.subplots(
+    len(names), 2 * len(cases), figsize=(13, 1.05 * len(names)), layout="constrained"
+)
+for row, name in enumerate(names):
+    if name != "accumulate":
+        method = jax.jit(
+            lambda *data, name=name: getattr(dof, name)(*data, max_coc=dof_cases.MAX_COC)
+        )
+    for column, (case, one) in enumerate(cases.items()):
+        if name == "accumulate":
+            picture = one.accumulated(256)
+        else:
+            picture = method(*one.through(dof_cases.CAMERA), one.lens)
+        left, right = axes[row, 2 * column : 2 * column + 2]
+        left.imshow(picture[12:-12, :, 0], cmap="gray", vmin=0, vmax=1)
+        right.plot(one.truth, color="0.6", linewidth=2.5)
+        right.plot(picture[dof_cases.MIDDLE, :, 0], color="C3", linewidth=1)
+        right.set(xticks=[], yticks=[], ylim=(-0.08, 1.08))
+        left.set(xticks=[], yticks=[])
+        if row == 0:
+            left.set_title(case, fontsize=9, loc="left")
+        if column == 0:
+            left.set_ylabel(
+                name.replace("_", "\n"), fontsize=8, rotation=0, ha="right", va="center"
+            )
+plt.show()
+
+# %% [markdown]
+# ## What none of them can do
+#
+# - All but the reference see one surface a pixel. Inside the edge of a blurred foreground the
+#   lens looks past it, at what the picture does not hold: no method of one layer gets
+#   *blurred foreground* right, and `depth_sorted` and `layered`, exact outside the edge, fail
+#   inside it as well. Two layers are what `layered(behind=...)` is for.
+# - `anisotropic_diffusion` and `implicit_diffusion` stop at every edge, so they never leak,
+#   never jump and lose nothing to rounding; and a blurred foreground keeps its outline as if
+#   cut out.
+# - `gather` reads over the circle of the pixel where it stands: its blurred foreground ends
+#   at its outline too, and its eight taps show, as does the picture of a point.
+# - `blend` blurs all by one width and fades it in, so that the sharp picture shines through
+#   what is a little out of focus; the halo of what is in focus lies on all that is not.
+# - `separable` makes squares of highlights, and corners leak where the second pass spreads
+#   what the first has mixed.
+# - Changes are slopes, not jumps, for all of them: each derivative can be followed by a fit.
