@@ -42,8 +42,8 @@ LAZY_LIBRARIES = {"embreex", "matplotlib", "OpenEXR", "OpenGL", "PIL", "pyrender
 # What may be given by position, in the order in which it is given.
 DATA = (
     *("render", "taps", "weights"),
-    *("image", "shadow_map", "gbuffer", "gbuffers", "depth"),
-    *("camera", "cameras", "receivers", "lens", "source", "target"),
+    *("image", "images", "shadow_map", "gbuffer", "gbuffers", "depth", "depths"),
+    *("camera", "cameras", "receivers", "lens", "source", "sources", "target"),
     *("origin", "direction", "light", "lights", "light_camera", "visibility", "coverage"),
 )
 

@@ -1,0 +1,106 @@
+"""The view rays of a target camera in the projected space of a source camera.
+
+A line of the world stays a line in (x, y, -1 / z). A point at depth s along the target's pixel
+p has the source's homogeneous pixel s m + b. For a pinhole, b is its eye and m = M p, with M
+the matrix of the two cameras at infinity. M is kept as its difference from the identity, which
+is 0 for two equal cameras: their rays then stay on their pixels, without rounding.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfx.camera import OrthographicCamera, PinholeCamera
+
+
+Camera = PinholeCamera | OrthographicCamera
+_Point = tuple[Array, Array, Array]
+
+
+class ViewRays(NamedTuple):
+    """Rays in (x, y, -1 / z) that run from t = 0 to 1, and which of them are in the frustum."""
+
+    origin: Float[Array, "ray 3"]
+    direction: Float[Array, "ray 3"]
+    inside: Bool[Array, " ray"]
+
+
+def view_rays(
+    source: PinholeCamera,
+    target: Camera,
+    pixels: Float[Array, "ray 2"],
+    *,
+    shape: tuple[int, int],
+    near: Float[Array, ""],
+) -> ViewRays:
+    """The rays of some target pixels, clipped to the source's frustum beyond `near`."""
+    far, eye = _lines(source, target, pixels)
+    begin, end = _clip(far, eye, shape, near)
+    start, stop = (_point(far, eye, jax.lax.stop_gradient(s)) for s in (begin, end))
+    origin = jnp.stack(start, axis=-1)
+    direction = jnp.stack([b - a for a, b in zip(start, stop, strict=True)], axis=-1)
+    inside = (begin < end) & jnp.isfinite(origin + direction).all(axis=-1)
+    origin, direction = (jnp.where(inside[:, None], x, 0) for x in (origin, direction))
+    return ViewRays(origin, direction, inside)
+
+
+def _lines(source: PinholeCamera, target: Camera, pixels: Array) -> tuple[_Point, _Point]:
+    """What is multiplied by the depth in the target, and what is added: m and b."""
+    dtype = pixels.dtype
+    lens, turn = (
+        source.intrinsics.astype(dtype),
+        source.world_from_camera[:3, :3].T.astype(dtype),
+    )
+    pose = target.world_from_camera.astype(dtype)
+    away = pose[:3, 3] - source.world_from_camera[:3, 3].astype(dtype)
+    x, y = pixels[:, 0], pixels[:, 1]
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    apart = turn @ (pose[:3, :3] - turn.T)
+    if isinstance(target, PinholeCamera):
+        target_lens = target.intrinsics.astype(dtype)
+        apart = ((lens - target_lens) + lens @ apart) @ jnp.linalg.inv(target_lens)
+        own, eye, plane = (x, y, one), lens @ (turn @ away), (zero, zero)
+    else:
+        apart = lens @ (apart + jnp.eye(3, dtype=dtype))
+        own, eye = (zero, zero, zero), lens @ (turn @ away)
+        scale, centre = target.pixels_per_unit.astype(dtype), target.centre.astype(dtype)
+        plane = (x - centre[0]) / scale, (y - centre[1]) / scale
+        x, y = zero, zero
+    far = [row[0] * x + row[1] * y + row[2] + its for row, its in zip(apart, own, strict=True)]
+    near = [
+        row[0] * plane[0] + row[1] * plane[1] + e for row, e in zip(apart, eye, strict=True)
+    ]
+    return tuple(far), tuple(near)
+
+
+def _clip(far: _Point, eye: _Point, shape: tuple[int, int], near: Array) -> tuple[Array, Array]:
+    """From which target depth to which a line is in the frustum: a r + b >= 0 for each side."""
+    height, width = shape
+    hold = jax.lax.stop_gradient
+    x, y, z = map(hold, far)
+    eye_x, eye_y, eye_z = map(hold, eye)
+    sides = [
+        (x, eye_x),
+        (width * z - x, width * eye_z - eye_x),
+        (y, eye_y),
+        (height * z - y, height * eye_z - eye_y),
+        (z, eye_z - hold(near)),
+    ]
+    begin, end = jnp.zeros_like(x), jnp.full_like(x, jnp.inf)
+    for grows, at_eye in sides:
+        crossing = -at_eye / jnp.where(grows == 0, 1, grows)
+        begin = jnp.where(grows > 0, jnp.maximum(begin, crossing), begin)
+        end = jnp.where(grows < 0, jnp.minimum(end, crossing), end)
+        end = jnp.where((grows == 0) & (at_eye < 0), -jnp.inf, end)
+    return begin, end
+
+
+def _point(far: _Point, eye: _Point, depth: Array) -> _Point:
+    """(x, y, -1 / z) of the source at a depth of the target, 0 and infinity among them."""
+    at_eye = depth == 0
+    inverse = 1 / jnp.where(at_eye, 1, depth)
+    x, y, z = (jnp.where(at_eye, e, f + inverse * e) for f, e in zip(far, eye, strict=True))
+    z = jnp.where(z > 0, z, 1)
+    return x / z, y / z, -jnp.where(at_eye, 1, inverse) / z

@@ -1,0 +1,57 @@
+"""The four searches under one call, whose cost under `vmap` is that of all rays together."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfx.reproject import _grid, _march, _walk
+from jaxfx.reproject._found import Found
+
+
+METHODS = {
+    "pyramid": _walk.walk,
+    "descent": _march.descend,
+    "linear": _march.linear,
+    "relief": _march.relief,
+}
+
+
+def search(
+    depth: Float[Array, "height width"],
+    origin: Float[Array, "ray 3"],
+    direction: Float[Array, "ray 3"],
+    method: str,
+    max_steps: int | None,
+) -> Found:
+    """Where each ray first meets the depth, a texel of which is +inf where nothing is.
+
+    Integer work: nothing is differentiated, and no derivative's pass meets its loops.
+    """
+    held = map(jax.lax.stop_gradient, (depth, origin, direction))
+    return _searcher(method, max_steps)(*held)
+
+
+_FOUND = jax.tree.structure(Found(*Found._fields))  # pyright: ignore[reportArgumentType]
+
+
+@functools.cache
+def _searcher(method: str, max_steps: int | None):
+    @jax.custom_batching.custom_vmap
+    def one(depth, origin, direction):
+        r = _grid.rays(origin, direction)
+        return METHODS[method](depth, r, _grid.entry(r, *depth.shape), max_steps)
+
+    @one.def_vmap
+    def many(size, batched, depth, origin, direction):
+        # A loop under `vmap` would run every search as long as the longest of them.
+        is_batched = jax.tree.unflatten(_FOUND, [True] * len(Found._fields))
+        each = lambda x, is_mapped: x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
+        origin, direction = each(origin, batched[1]), each(direction, batched[2])
+        if batched[0]:
+            return jax.lax.map(lambda args: one(*args), (depth, origin, direction)), is_batched
+        found = one(depth, origin.reshape(-1, 3), direction.reshape(-1, 3))
+        return jax.tree.map(lambda x: x.reshape(size, -1), found), is_batched
+
+    return one

@@ -1,0 +1,92 @@
+"""From the texel that a search found to the point on the surface, with its derivative.
+
+At the hit, F(t) = z(t) - D(x(t), y(t)) = 0, hence dt = -dF / F_t: the time is what was found,
+less the differentiable F over a held F_t. No loop is differentiated.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfx.reproject._found import TOP, X_SIDE, Y_SIDE, Found
+from jaxfx.reproject._patch import patch
+
+
+# Newton steps on the patch; how far from the texel's hit they may lead, in texels; how long
+# the last may be; below which share of its terms F_t counts as grazing.
+_NEWTON, _REACH, _ARRIVED, _GRAZING = 4, 1.5, 1e-2, 1e-3
+
+
+class Point(NamedTuple):
+    """Where on its line each ray meets the surface; whether that is too slanting to tell."""
+
+    position: Float[Array, "ray 3"]
+    grazing: Bool[Array, " ray"]
+
+
+def texel_point(depth: Array, origin: Array, direction: Array, found: Found) -> Point:
+    """The hit on the top or on a side of a texel."""
+    time, hold = found.time, jax.lax.stop_gradient
+    x, y, z = jnp.moveaxis(origin + time[:, None] * direction, -1, 0)
+    dx, dy, dz = jnp.moveaxis(hold(direction), -1, 0)
+    top = jnp.where(found.mask, depth[found.y, found.x], 0)
+    # What is 0 at the hit, and how fast it grows along the ray.
+    held = [jnp.zeros_like(x)] * 4
+    miss, slope = list(held), [jnp.ones_like(x)] * 4
+    miss[TOP], slope[TOP] = z - jnp.where(jnp.isfinite(top), top, 0), dz
+    miss[X_SIDE], slope[X_SIDE] = x, dx
+    miss[Y_SIDE], slope[Y_SIDE] = y, dy
+    miss, slope = (jnp.choose(found.side, v, mode="clip") for v in (miss, slope))
+    grazing = (slope == 0) & found.mask
+    return _differentiable(origin, direction, time, miss, slope, found.mask & ~grazing, grazing)
+
+
+def bilinear_point(
+    depth: Array, origin: Array, direction: Array, found: Found, threshold: int | float | None
+) -> Point:
+    """The hit on the patch through the texels' centres, near the one that was found.
+
+    Where the ray does not meet the patch within a texel or so, the texel's own hit stays.
+    """
+    hold = jax.lax.stop_gradient
+    depth_held, o, d = hold(depth), hold(origin), hold(direction)
+    anchor = jnp.where(found.mask, depth_held[found.y, found.x], 0)
+
+    def gap(depth, origin, direction, time):
+        x, y, z = jnp.moveaxis(origin + time[:, None] * direction, -1, 0)
+        return z - patch(depth_held, x, y, anchor, threshold).read(depth)
+
+    along = lambda time: jax.jvp(
+        lambda t: gap(depth_held, o, d, t), (time,), (jnp.ones_like(time),)
+    )
+    per_texel = jnp.maximum(jnp.abs(d[:, 0]), jnp.abs(d[:, 1]))
+    reach = jnp.where(per_texel > 0, _REACH / jnp.where(per_texel > 0, per_texel, 1), jnp.inf)
+    low, high = jnp.maximum(found.time - reach, 0), found.time + reach
+
+    def newton(_, state):
+        time, _ = state
+        value, slope = along(time)
+        move = -value / jnp.where(slope > 0, slope, 1)
+        new = jnp.where(slope > 0, jnp.clip(time + move, low, high), time)
+        return new, jnp.where(slope > 0, jnp.abs(move), jnp.inf)
+
+    start = found.time, jnp.full_like(found.time, jnp.inf)
+    time, last = jax.lax.fori_loop(0, _NEWTON, newton, start)
+    _, slope = along(time)
+    terms = jnp.abs(d[:, 2]) + jnp.abs(slope - d[:, 2])
+    steep = slope > _GRAZING * terms
+    arrived = steep & (last * per_texel < _ARRIVED) & found.mask
+    time = jnp.where(arrived, time, found.time)
+    miss = gap(depth, origin, direction, time)
+    grazing = found.mask & ~arrived
+    return _differentiable(origin, direction, time, miss, slope, arrived, grazing)
+
+
+def _differentiable(origin, direction, time, miss, slope, known, grazing) -> Point:
+    """The position at a held time that follows the arguments, where `known`."""
+    hold = jax.lax.stop_gradient
+    miss = jnp.where(known, miss, 0)
+    time = hold(time) - (miss - hold(miss)) / hold(jnp.where(known, slope, 1))
+    return Point(origin + time[:, None] * direction, grazing)

@@ -1,0 +1,161 @@
+"""The exact traversal of a minimum pyramid, all rays in step, the live ones kept together.
+
+The state of a ray is one integer: the texel in which it is, and the level at which it looks.
+Hence a step is one fused loop with one result, and the time of a ray follows from its texel.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from jaxfx._pyramid import Pyramid, minimum_pyramid
+from jaxfx.reproject import _grid
+from jaxfx.reproject._found import START, TOP, X_SIDE, Y_SIDE, Found
+from jaxfx.reproject._grid import Moment, Rays
+
+
+_BITS = 13
+LARGEST = 2**_BITS
+_TEXEL = LARGEST - 1
+HIT, MISS = 15, 14  # as levels
+# Below so many rays their bookkeeping costs more than the steps that it saves.
+_FEW = 4096
+
+
+def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> UInt32[Array, "..."]:
+    """Column, row and level as one integer, with the two signs that the ray's direction has."""
+    bits = level.astype(jnp.uint32)
+    for size, value in ((1, left), (1, up), (_BITS, y), (_BITS, x)):
+        bits = (bits << size) | value.astype(jnp.uint32)
+    return bits
+
+
+def unpack(state: UInt32[Array, "..."]) -> tuple[Array, Array, Array, Array, Array]:
+    """The five that were packed."""
+    x, y = (state & _TEXEL).astype(jnp.int32), ((state >> _BITS) & _TEXEL).astype(jnp.int32)
+    up, left = (((state >> bit) & 1).astype(jnp.int32) for bit in (2 * _BITS, 2 * _BITS + 1))
+    return x, y, level_of(state).astype(jnp.int32), left, up
+
+
+def level_of(state: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
+    """The level alone."""
+    return state >> (2 * _BITS + 2)
+
+
+def step(pyramid: Pyramid, r: Rays, state: UInt32[Array, " ray"]) -> UInt32[Array, " ray"]:
+    """One texel of one level for every ray that is not done."""
+    height, width = pyramid.shapes[0]
+    x, y, level, left, up = unpack(state)
+    look = jnp.minimum(level, len(pyramid.shapes) - 1)
+    columns = jnp.asarray([shape[1] for shape in pyramid.shapes], jnp.int32)[look]
+    offset = jnp.asarray(pyramid.offsets, jnp.int32)[look]
+    node_x, node_y = x >> look, y >> look
+    index = offset + node_y * columns + node_x
+    nearest = pyramid.values.at[index].get(mode="promise_in_bounds")
+
+    border_x, border_y = (node_x + 1 - left) << look, (node_y + 1 - up) << look
+    leave_x = _grid.crossing(border_x, r.ox, r.ix, left)
+    leave_y = _grid.crossing(border_y, r.oy, r.iy, up)
+    leave = _grid.first(leave_x, leave_y)
+    now = _grid.latest(_grid.start(r), *_grid.came(r, x, y, left, up))
+    # A ray parallel to the image reaches a depth at once, -inf or NaN, or at +inf: never.
+    reach = (nearest - r.oz) * r.iz
+    ahead = (r.iz > 0) & (now.time < reach)
+    at = Moment(jnp.where(ahead, reach, now.time), now.after & ~ahead)
+    sinks_in_time = (now.time < reach) | ((now.time == reach) & ~now.after)
+    reached = jnp.where(r.iz > 0, _grid.earlier(at, leave), sinks_in_time) & (nearest < jnp.inf)
+
+    # The texel in which the ray is next: where it reaches the depth, or beyond the border.
+    go = Moment(jnp.where(reached, reach, leave.time), leave.after & ~reached)
+    along_x = _between(_grid.cell_at(go, r.ox, r.dx, left), x, node_x, look, left)
+    along_y = _between(_grid.cell_at(go, r.oy, r.dy, up), y, node_y, look, up)
+    crosses_x, crosses_y = ~_grid.earlier(leave_y, leave_x), ~_grid.earlier(leave_x, leave_y)
+    next_x = jnp.where(~reached & crosses_x, border_x - left, along_x)
+    next_y = jnp.where(~reached & crosses_y, border_y - up, along_y)
+    stays = reached & ~ahead
+    next_x, next_y = jnp.where(stays, x, next_x), jnp.where(stays, y, next_y)
+    same_parent = ((next_x ^ x) | (next_y ^ y)) >> (level + 1) == 0
+    next_level = jnp.where(reached, level - 1, jnp.where(same_parent, level, level + 1))
+
+    hit = reached & (level == 0)
+    outside = (next_x < 0) | (next_x >= width) | (next_y < 0) | (next_y >= height)
+    gone = outside | (~reached & (leave.time == jnp.inf))
+    next_level = jnp.where(hit, HIT, jnp.where(gone, MISS, next_level))
+    next_x, next_y = jnp.where(hit | gone, x, next_x), jnp.where(hit | gone, y, next_y)
+    return jnp.where(level >= MISS, state, pack(next_x, next_y, next_level, left, up))
+
+
+def _between(cell: Array, start: Array, node: Array, level: Array, backward: Array) -> Array:
+    """A row or column held to those of a node that the ray has not left behind."""
+    first, last = node << level, ((node + 1) << level) - 1
+    low, high = jnp.where(backward == 1, first, start), jnp.where(backward == 1, start, last)
+    return jnp.clip(cell, low, high)
+
+
+def walk(
+    depth: Float[Array, "height width"],
+    r: Rays,
+    begin: _grid.Entry,
+    max_steps: int | None,
+) -> Found:
+    """The first texel that every ray reaches in depth."""
+    pyramid = minimum_pyramid(depth)
+    left, up = _grid.backward(r)
+    top = jnp.full_like(begin.x, len(pyramid.shapes) - 1)
+    none = jnp.zeros_like(begin.x)
+    x, y = (jnp.where(begin.inside, cell, none) for cell in (begin.x, begin.y))
+    state = pack(x, y, jnp.where(begin.inside, top, MISS), left, up)
+    limit = np.iinfo(np.int32).max if max_steps is None else max_steps
+    state, steps = _walk(pyramid, r, state, none, limit)
+
+    x, y, level, _, _ = unpack(state)
+    when_x, when_y = _grid.came(r, x, y, left, up)
+    now = _grid.latest(_grid.start(r), when_x, when_y).time
+    reach = (depth[y, x] - r.oz) * r.iz
+    on_top = (r.iz > 0) & (reach >= now)
+    side = jnp.where(when_x.time == now, X_SIDE, Y_SIDE)
+    side = jnp.where(now == 0, START, side)
+    return Found(
+        time=jnp.where(on_top, reach, now),
+        x=x,
+        y=y,
+        side=jnp.where(on_top, TOP, side),
+        mask=level == HIT,
+        steps=steps,
+        exhausted=level < MISS,
+    )
+
+
+def _walk(pyramid, r, state, steps, max_steps):
+    """All rays step until half of them are done; then the others go on by themselves.
+
+    So all the work is at most twice the number of steps that the rays take together.
+    """
+    few = 0 if len(state) <= _FEW else -(-len(state) // 2)
+
+    def alive(state, steps):
+        return (level_of(state) < MISS) & (steps < max_steps)
+
+    def goes_on(carry):
+        return jnp.sum(alive(*carry), dtype=jnp.int32) > few
+
+    def body(carry):
+        state, steps = carry
+        live = alive(state, steps)
+        return jnp.where(live, step(pyramid, r, state), state), steps + live.astype(jnp.int32)
+
+    state, steps = jax.lax.while_loop(goes_on, body, (state, steps))
+    if few:
+        live = alive(state, steps)
+        place = jnp.where(live, jnp.cumsum(live, dtype=jnp.int32) - 1, few)
+        numbers = jnp.arange(len(state), dtype=jnp.int32)
+        chosen = jnp.full(few, len(state), jnp.int32).at[place].set(numbers, mode="drop")
+        take = lambda x: x.at[chosen].get(mode="fill", fill_value=0)
+        rest = jnp.where(chosen < len(state), take(state), jnp.uint32(MISS << (2 * _BITS + 2)))
+        ends = _walk(pyramid, Rays(*map(take, r)), rest, take(steps), max_steps)
+        state, steps = (
+            x.at[chosen].set(end, mode="drop")
+            for x, end in zip((state, steps), ends, strict=True)
+        )
+    return state, steps

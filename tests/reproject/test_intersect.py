@@ -1,0 +1,369 @@
+"""The search against a walk over every texel; where the quick methods fail, and how often."""
+
+import inspect
+import itertools
+import math
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx.reproject import intersect
+
+
+SIZES = [(1, 1), (2, 3), (5, 5), (17, 61), (64, 64), (257, 64)]
+run = jax.jit(
+    intersect,
+    static_argnames=("method", "max_steps", "surface"),
+)
+METHODS = ("pyramid", "descent", "linear", "relief")
+
+
+def grid_walk(depth, origin, direction):
+    """The time of the first t >= 0 with z(t) >= depth[floor y, floor x]; None for a miss.
+
+    All crossings are sorted. A ray towards larger coordinates is in the next texel at the
+    crossing (key 0), one towards smaller coordinates just after it (key 1).
+    """
+    height, width = depth.shape
+    start = [float(v) for v in origin[:2]]
+    events = [(0.0, 0)]
+    for axis, size in ((0, width), (1, height)):
+        if direction[axis] != 0:
+            times = ((np.arange(size + 1) - start[axis]) / direction[axis]).tolist()
+            events += [(t, int(direction[axis] < 0)) for t in times]
+    events = [*sorted({event for event in events if event >= (0.0, 0)}), (math.inf, 0)]
+    for now, after in itertools.pairwise(events):
+        cell = [_cell(start[axis], direction[axis], now) for axis in (0, 1)]
+        if 0 <= cell[0] < width and 0 <= cell[1] < height:
+            time = _reach(depth[cell[1], cell[0]], origin[2], direction[2], now, after)
+            if time is not None:
+                return time, tuple(cell)
+    return None
+
+
+def _cell(start, slope, now):
+    """The row or column at a moment, by counting borders rather than by rounding a product."""
+    if slope == 0:
+        return math.floor(start)
+    # The border k has been crossed if its moment is not later than now.
+    guess = math.floor(start + now[0] * slope)
+    candidates = range(guess - 2, guess + 3)
+    if slope > 0:
+        return max(k for k in candidates if ((k - start) / slope, 0) <= now)
+    return min(k - 1 for k in (*candidates, guess + 3) if ((k - start) / slope, 1) <= now)
+
+
+def _reach(depth, z, dz, now, after):
+    """The first time in [now, after) at which the ray is as deep as a texel."""
+    if not depth < math.inf:
+        return None
+    if dz > 0:
+        time = max(now, ((depth - z) / dz, 0))
+        return time[0] if time < after else None
+    if dz == 0:
+        return now[0] if z >= depth else None
+    until = ((depth - z) / dz, 1)
+    return now[0] if now < until else None
+
+
+def field(size, rng):
+    """Random depths with holes of every kind."""
+    depth = rng.uniform(0.2, 1, size)
+    kind = rng.random(size)
+    depth[kind < 0.15] = np.inf
+    depth[kind < 0.10] = 0
+    depth[kind < 0.05] = np.nan
+    return depth
+
+
+def awkward_rays(size, rng, count=150):
+    """Half of them anywhere; half on borders and corners, along axes and diagonals."""
+    side = max(size)
+    origin = rng.uniform((-2, -2, -0.5), (side + 2, side + 2, 1.2), (2 * count, 3))
+    direction = rng.normal(size=(2 * count, 3)) * (side / 2, side / 2, 1)
+    origin[count:, :2] = np.round(origin[count:, :2] * 2) / 2
+    origin[count:, 2] = np.round(origin[count:, 2] * 4) / 4
+    direction[count:] = rng.choice([0, 1, -1, 2, -2, 0.5, -0.5], (count, 3))
+    return origin, direction
+
+
+def check_exact(hit, depth, origin, direction, tolerance):
+    known = np.where(depth > 0, depth, np.inf).astype(float)
+    found = 0
+    for k in range(len(origin)):
+        o, d = origin[k].astype(float), direction[k].astype(float)
+        expected = grid_walk(known, o, d)
+        assert bool(hit.mask[k]) == (expected is not None), (o, d)
+        if expected is not None:
+            place = o + expected[0] * d
+            np.testing.assert_allclose(hit.position[k], place, rtol=0, atol=tolerance)
+            found += 1
+    return found
+
+
+@pytest.mark.parametrize("size", SIZES, ids="{0[0]}x{0[1]}".format)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_pyramid_finds_what_a_walk_over_every_texel_finds(size, dtype):
+    rng = np.random.default_rng(size)
+    depth = field(size, rng).astype(dtype)
+    origin, direction = (x.astype(dtype) for x in awkward_rays(size, rng))
+    hit = run(depth, origin, direction)
+    assert hit.position.dtype == dtype
+    assert not hit.exhausted.any()
+    found = check_exact(hit, depth, origin, direction, 1e-4)
+    assert found > 30 or size == (1, 1)
+
+
+def test_many_rays_go_on_in_halves():
+    rng = np.random.default_rng(5)
+    depth = field((64, 64), rng)
+    origin = rng.uniform((0, 0, 0), (64, 64, 0.1), (9000, 3))
+    direction = rng.normal(size=(9000, 3)) * (64, 64, 1)
+    hit = run(depth, origin, direction)
+    pick = rng.choice(9000, 400, replace=False)
+    some = jax.tree.map(lambda x: x[pick], hit)
+    assert check_exact(some, depth, origin[pick], direction[pick], 1e-9) > 100
+
+
+def test_under_vmap_every_ray_finds_the_same_in_as_many_steps():
+    rng = np.random.default_rng(6)
+    depths = np.stack([field((17, 13), rng) for _ in range(3)])
+    origin, direction = awkward_rays((17, 13), rng, 30)
+    both = jax.vmap(lambda d: run(d, origin, direction))(depths)
+    rays = jax.vmap(lambda o, d: run(depths[0], o, d))(origin, direction)
+    for k, depth in enumerate(depths):
+        one = run(depth, origin, direction)
+        jax.tree.map(
+            np.testing.assert_array_equal, jax.tree.map(lambda x, k=k: x[k], both), one
+        )
+        if k == 0:
+            jax.tree.map(np.testing.assert_array_equal, rays, one)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("hole", [0.0, np.nan, np.inf, -1.0])
+def test_a_field_of_holes_is_never_hit(method, hole):
+    rng = np.random.default_rng(0)
+    origin, direction = awkward_rays((5, 6), rng, 20)
+    hit = run(np.full((5, 6), hole), origin, direction, method=method)
+    assert not hit.mask.any()
+    np.testing.assert_array_equal(hit.position, origin)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_rays_that_are_not_numbers_miss(method):
+    origin = np.array([[np.nan, 1, 0], [1, 1, 0], [np.inf, 0, 0], [1, 1, np.nan]])
+    direction = np.array([[0, 0, 1], [np.nan, 0, 1], [0, 1, 0], [1, 1, 1.0]])
+    assert not run(np.ones((3, 3)), origin, direction, method=method).mask.any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_vertical_ray_meets_its_texel(method):
+    depth = np.random.default_rng(0).uniform(0.2, 1, (5, 7))
+    y, x = np.mgrid[:5, :7] + 0.5
+    origin = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    direction = np.broadcast_to([0.0, 0.0, 2.0], origin.shape)
+    hit = run(depth, origin, direction, method=method)
+    assert hit.mask.all()
+    # Relief mapping ends within its last halving.
+    tolerance = 2e-4 if method == "relief" else 1e-12
+    np.testing.assert_allclose(hit.position, np.stack([x, y, depth], -1), atol=tolerance)
+
+
+def test_a_bound_on_steps_is_kept_and_said():
+    rng = np.random.default_rng(1)
+    depth = field((64, 64), rng)
+    origin, direction = awkward_rays((64, 64), rng)
+    free = run(depth, origin, direction)
+    bound = int(np.median(free.steps))
+    hit = run(depth, origin, direction, max_steps=bound)
+    np.testing.assert_array_equal(hit.exhausted, free.steps > bound)
+    assert hit.exhausted.any() and not (hit.mask & hit.exhausted).any()
+    np.testing.assert_array_equal(hit.steps, np.minimum(free.steps, bound))
+    within = ~np.asarray(hit.exhausted)
+    np.testing.assert_array_equal(hit.mask[within], free.mask[within])
+
+
+# Where the methods fail. Rays at a slant over a field, `slope` texels to each tenth of depth.
+
+
+def slanted_rays(size, slope):
+    y, x = np.mgrid[:size, :size] + 0.5
+    origin = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    direction = np.array([np.cos(0.4), np.sin(0.4), 0.1 / max(slope, 1e-9)])
+    if slope == 0:
+        direction = np.array([0, 0, 1.0])
+    back = 0.35 / direction[2] * direction
+    return origin - back * (1, 1, 0), np.broadcast_to(direction, origin.shape)
+
+
+def smooth(size):
+    y, x = np.mgrid[:size, :size] / size
+    return 0.6 + 0.1 * np.sin(9 * x) * np.cos(7 * y)
+
+
+def posts(size):
+    """One-texel posts and one-texel gaps."""
+    depth = np.full((size, size), 0.7)
+    depth[4::9, 4::9] = 0.3
+    depth[:, size // 2 :] = 0.4
+    depth[4::9, size // 2 + 4 :: 9] = 0.7
+    return depth
+
+
+def cliff(size):
+    depth = np.full((size, size), 0.8)
+    depth[:, size // 2 :] = 0.3
+    return depth
+
+
+def error_rate(depth, slope, method, max_steps=None):
+    """The share of rays whose mask is wrong or whose hit is over a texel off."""
+    origin, direction = slanted_rays(len(depth), slope)
+    exact = run(depth, origin, direction)
+    hit = run(depth, origin, direction, method=method, max_steps=max_steps)
+    off = np.abs(np.asarray(hit.position - exact.position))[:, :2].max(axis=1) > 1
+    wrong = np.asarray(hit.mask != exact.mask) | (off & np.asarray(exact.mask))
+    return float(wrong.mean())
+
+
+@pytest.mark.parametrize("make", [smooth, posts, cliff])
+@pytest.mark.parametrize("slope", [0, 4, 16])
+def test_the_fields_of_the_chart_are_met_exactly(make, slope):
+    depth = make(48)
+    origin, direction = slanted_rays(48, slope)
+    hit = run(depth, origin, direction)
+    check_exact(jax.tree.map(lambda x: x[::7], hit), depth, origin[::7], direction[::7], 1e-9)
+
+
+# From view to grazing: at least so often the method errs on posts, and on a cliff.
+FAILURES = [
+    ("descent", None, posts, 4, 0.02),
+    ("descent", None, posts, 16, 0.1),
+    ("descent", None, cliff, 16, 0.05),
+    ("linear", 8, posts, 4, 0.02),
+    ("linear", 8, posts, 16, 0.1),
+    ("linear", 8, cliff, 16, 0.05),
+    ("relief", 8, posts, 16, 0.1),
+]
+
+
+@pytest.mark.parametrize(("method", "steps", "make", "slope", "least"), FAILURES)
+def test_where_a_quick_method_fails(method, steps, make, slope, least):
+    assert error_rate(make(48), slope, method, steps) > least
+
+
+@pytest.mark.parametrize("method", ["linear", "relief"])
+def test_more_steps_err_less(method):
+    rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 32, 256)]
+    assert rates[0] > rates[1] > rates[2]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_method_errs_from_the_front(method):
+    assert error_rate(posts(48), 0, method) == 0
+
+
+def test_steps_hardly_grow_with_the_size():
+    mean = {}
+    for size in (64, 256):
+        # The same picture in finer texels: the slant, in texels, grows with it.
+        origin, direction = slanted_rays(size, 6 * size / 64)
+        hit = run(smooth(size), origin, direction)
+        inside = ((origin[:, :2] >= 0) & (origin[:, :2] < size)).all(axis=1)
+        mean[size] = float(hit.steps[inside].mean())
+    assert mean[256] < 1.6 * mean[64]
+
+
+# The bilinear surface, and derivatives.
+
+
+def plane(size):
+    y, x = np.mgrid[:size, :size] + 0.5
+    return 0.3 + 0.02 * x + 0.01 * y
+
+
+def test_bilinear_meets_a_plane_where_it_is():
+    origin, direction = slanted_rays(32, 2)
+    hit = run(plane(32), origin, direction, surface="bilinear")
+    x, y, z = np.moveaxis(np.asarray(hit.position), -1, 0)
+    inner = np.asarray(hit.mask) & (np.minimum(x, y) > 2) & (np.maximum(x, y) < 30)
+    assert inner.sum() > 300 and not hit.grazing[inner].any()
+    np.testing.assert_allclose(z[inner], (0.3 + 0.02 * x + 0.01 * y)[inner], atol=1e-9)
+
+
+@pytest.mark.parametrize("surface", ["texel", "bilinear"])
+def test_the_derivative_is_that_of_the_closed_form(surface):
+    """A ray on a texel's top or on a plane: t = (D - z) / dz, or (D(o) - z) / (dz - D' d)."""
+    depth, origin = jnp.asarray(plane(8)), jnp.array([4.3, 4.1, 0.0])
+    direction = jnp.array([0.01, -0.02, 1.0])
+    time = lambda depth, o, d: run(depth, o, d, surface=surface).position[2]
+    if surface == "texel":
+        expected = lambda depth, o, d: depth[4, 4] + 0 * jnp.sum(o * d)
+    else:
+
+        def expected(depth, o, d):
+            slope_x, slope_y = depth[4, 4] - depth[4, 3], depth[4, 4] - depth[3, 4]
+            at = depth[3, 3] + slope_x * (o[0] - 3.5) + slope_y * (o[1] - 3.5)
+            t = (at - o[2]) / (d[2] - slope_x * d[0] - slope_y * d[1])
+            return o[2] + t * d[2]
+
+    arguments = depth, origin, direction
+    np.testing.assert_allclose(time(*arguments), expected(*arguments), atol=1e-9)
+    ours = jax.grad(time, argnums=(1, 2))(*arguments)
+    theirs = jax.grad(expected, argnums=(1, 2))(*arguments)
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    pushed = jax.jvp(lambda *x: time(depth, *x), arguments[1:], (direction, origin))[1]
+    np.testing.assert_allclose(
+        pushed, jnp.dot(theirs[0], direction) + jnp.dot(theirs[1], origin), atol=1e-9
+    )
+    # In depth itself: the shares of the four texels, or the one texel alone.
+    moved = jax.grad(time)(*arguments)
+    assert float(jnp.sum(moved)) == pytest.approx(
+        float(jax.grad(lambda s: expected(depth + s, origin, direction))(0.0)), abs=1e-9
+    )
+
+
+def test_a_hit_on_a_side_moves_with_the_ray_and_not_with_depth():
+    depth = jnp.where(jnp.arange(6)[None] < 3, 0.9, 0.2) * jnp.ones((6, 1))
+    origin, direction = jnp.array([0.5, 2.5, 0.0]), jnp.array([4.0, 1.0, 1.0])
+    hit = lambda depth, o: run(depth, o, direction).position
+    np.testing.assert_allclose(hit(depth, origin), [3.0, 2.5 + 0.625, 0.625])
+    np.testing.assert_allclose(
+        jax.jacobian(hit, argnums=1)(depth, origin),
+        [[0, 0, 0], [-0.25, 1, 0], [-0.25, 0, 1]],
+        atol=1e-12,
+    )
+    assert not jax.jacobian(hit)(depth, origin).any()
+
+
+def test_a_miss_and_a_slanting_ray_have_finite_derivatives():
+    depth = jnp.full((4, 4), 0.5)
+    origin = jnp.array([[9.0, 9.0, 0.0], [0.2, 0.2, 0.5], [1.0, 1.0, 0.7]])
+    direction = jnp.array([[1.0, 0.0, 1.0], [1.0, 0.5, 0.0], [0.5, 0.5, -1.0]])
+    for surface in ("texel", "bilinear"):
+        hit = run(depth, origin, direction, surface=surface)
+        np.testing.assert_array_equal(hit.mask, [False, True, True])
+        total = lambda *x, surface=surface: jnp.sum(run(*x, surface=surface).position)
+        moved = jax.grad(total, argnums=(0, 1, 2))(depth, origin, direction)
+        assert all(np.isfinite(m).all() for m in moved)
+
+
+FAULTS = {
+    "intersect(depth)": {"depth": np.ones(3)},
+    "intersect(origin)": {"origin": np.ones((4, 2))},
+    "intersect(direction)": {"direction": np.ones((5, 3))},
+    "intersect(method=...)": {"method": "fast"},
+    "intersect(surface=...)": {"surface": "smooth"},
+    "intersect(max_steps=...)": {"max_steps": 0},
+}
+
+
+@pytest.mark.parametrize(("name", "fault"), FAULTS.items(), ids=FAULTS)
+def test_bad_arguments_are_named(name, fault):
+    given = {"depth": np.ones((3, 3)), "origin": np.ones((4, 3)), "direction": np.ones((4, 3))}
+    with pytest.raises(ValueError, match=re.escape(f"`{name}`")):
+        inspect.unwrap(intersect)(**given | fault)

@@ -1,0 +1,243 @@
+"""Pictures from other cameras, against cameras, planes and meshes whose view is known."""
+
+import inspect
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx import OrthographicCamera, PinholeCamera, relight, scene
+from jaxfx.reproject import warp
+
+
+run = jax.jit(
+    warp,
+    static_argnames=("shape", "method", "hole_threshold"),
+)
+
+
+def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
+    pose = np.eye(4)
+    c, s = np.cos(turn), np.sin(turn)
+    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    pose[:3, 3] = at
+    return PinholeCamera.from_fov(0.9, height=height, width=width, world_from_camera=pose)
+
+
+def picture(height=24, width=32):
+    y, x = np.mgrid[:height, :width] / height
+    return np.stack([np.sin(7 * x + y), np.cos(5 * y - x), x * y], axis=-1) + 1.5
+
+
+@pytest.mark.parametrize("method", ["pyramid", "descent", "linear"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_same_camera_gives_the_same_picture(method, dtype):
+    rng = np.random.default_rng(0)
+    image = rng.random((24, 32, 3)).astype(dtype)
+    depth = rng.uniform(1, 9, (24, 32)).astype(dtype)
+    depth[rng.random((24, 32)) < 0.2] = np.inf
+    eye = camera(at=(3.1, -2.2, 0.7), turn=0.3)
+    drawn, alpha = run(image, depth, eye, eye, method=method)
+    np.testing.assert_array_equal(drawn, image)
+    np.testing.assert_array_equal(alpha, 1)
+    assert drawn.dtype == alpha.dtype == dtype
+
+
+@pytest.mark.parametrize("move", [(0.3, 0.1, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5)])
+def test_a_plane_moves_by_its_homography(move):
+    """A linear picture of a fronto-parallel plane, read where the plane's points project to."""
+    y, x = np.mgrid[:24, :32] + 0.5
+    image, depth = np.stack([x, y], axis=-1), np.full((24, 32), 2.0)
+    source, target = camera(), camera(at=move)
+    drawn, alpha = run(image, depth, source, target)
+    points = target.unproject(jnp.stack([x, y], axis=-1), jnp.full(x.shape, 2.0 - move[2]))
+    expected = np.asarray(source.project(points)[0])
+    inside = ((expected > 0) & (expected < (32, 24))).all(axis=-1)
+    np.testing.assert_array_equal(alpha > 0, inside)
+    inner = ((expected > 0.5) & (expected < (31.5, 23.5))).all(axis=-1)
+    np.testing.assert_allclose(drawn[inner], expected[inner], atol=1e-9)
+    assert not np.asarray(drawn)[~np.asarray(inside)].any()
+
+
+def test_the_sky_turns_with_the_camera():
+    image, depth = picture(), np.full((24, 32), np.inf)
+    drawn, alpha = run(image, depth, camera(), camera(at=(5.0, 1.0, -3.0), turn=0.2))
+    turned, same = run(image, np.full((24, 32), 4.0), camera(), camera(turn=0.2))
+    np.testing.assert_array_equal(alpha, same)
+    np.testing.assert_allclose(drawn, turned, atol=1e-9)
+    assert 0.5 < alpha.mean() < 0.9
+
+
+def test_from_behind_nothing_is_seen_but_what_lies_ahead():
+    image, depth = picture(), np.full((24, 32), 2.0)
+    away = run(image, depth, camera(), camera(at=(0, 0, 1.0), turn=np.pi))[1]
+    assert not away.any()
+    # Beyond the wall, looking back at it: its back was not seen.
+    back = run(image, depth, camera(), camera(at=(0, 0, 4.0), turn=np.pi))[1]
+    assert not back.any()
+
+
+def test_an_orthographic_target():
+    y, x = np.mgrid[:24, :32] + 0.5
+    image, depth = np.stack([x, y], axis=-1), np.full((24, 32), 2.0)
+    target = OrthographicCamera(20.0, [16.0, 12.0], np.eye(4))
+    drawn, alpha = run(image, depth, camera(), target)
+    points = target.unproject(jnp.stack([x, y], axis=-1), jnp.full(x.shape, 2.0))
+    expected = np.asarray(camera().project(points)[0])
+    inner = ((expected > 0.5) & (expected < (31.5, 23.5))).all(axis=-1)
+    assert inner.sum() > 100 and alpha[inner].all()
+    np.testing.assert_allclose(drawn[inner], expected[inner], atol=1e-9)
+
+
+def test_holes_are_not_read_and_do_not_spread():
+    image, depth = picture(), np.full((24, 32), 2.0)
+    whole, _ = run(image, depth, camera(), camera(at=(0.1, 0, 0)))
+    for hole in (0.0, np.nan):
+        holed, hurt = depth.copy(), image.copy()
+        holed[10:14, 12:16], hurt[10:14, 12:16] = hole, np.nan
+        drawn, alpha = run(hurt, holed, camera(), camera(at=(0.1, 0, 0)))
+        assert np.isfinite(drawn).all()
+        assert 10 <= (np.asarray(alpha) == 0)[9:15, 10:17].sum() <= 24
+        far = np.ones((24, 32), bool)
+        far[8:16, 8:18] = False
+        far[:, :3] = False
+        np.testing.assert_allclose(np.asarray(drawn)[far], np.asarray(whole)[far], atol=1e-12)
+
+
+@pytest.mark.parametrize("threshold", [0.1, 3.0])
+def test_a_cliff_opens_a_gap_unless_it_counts_as_one_surface(threshold):
+    image, depth = picture(), np.full((24, 32), 4.0)
+    depth[:, 16:] = 2.0
+    _, alpha = run(image, depth, camera(), camera(at=(0.4, 0, 0)), hole_threshold=threshold)
+    # The gap's width: the parallax between the two depths.
+    focal = float(camera().intrinsics[0, 0])
+    closed = float((1 - alpha[:, :27]).sum(axis=1).mean())
+    _, left = run(image, depth, camera(), camera(at=(-0.4, 0, 0)), hole_threshold=threshold)
+    gap = float((1 - left[:, 8:]).sum(axis=1).mean())
+    assert closed == 0
+    assert gap == (0 if threshold == 3.0 else pytest.approx(0.4 * focal / 4, abs=1.0))
+
+
+def visible(depth, source, target, target_depth):
+    """Which of the target's pixels the source saw too, from the true depth of both."""
+    height, width = depth.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    points = target.unproject(jnp.stack([x, y], -1), jnp.asarray(target_depth, float))
+    pixels, z = map(np.nan_to_num, source.project(points))
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=-1) & (z > 0)
+    column, row = np.clip(pixels, 0, (width - 1, height - 1)).astype(int).T
+    return inside & (z < 1.03 * np.asarray(depth)[row.T, column.T])
+
+
+def orbit(eye, degrees, distance):
+    """The camera turned about a point on its axis."""
+    pose, a = np.asarray(eye.world_from_camera, float), np.deg2rad(degrees)
+    pivot = pose[:3, 3] + distance * pose[:3, 2]
+    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    new = np.eye(4)
+    new[:3, :3] = turn @ pose[:3, :3]
+    new[:3, 3] = pivot + turn @ (pose[:3, 3] - pivot)
+    return PinholeCamera(np.asarray(eye.intrinsics, float), new)
+
+
+def test_the_still_life_turned_against_the_still_life_rendered():
+    side = 96
+    life = scene.still_life()
+    eye = scene.default_camera(life, height=side, width=side)
+    lights = scene.default_lights(eye)
+
+    def taken(eye):
+        buffer = scene.gbuffer(life, eye, height=side, width=side)
+        return np.asarray(relight.render(buffer, eye, lights)), buffer.depth
+
+    image, depth = taken(eye)
+    psnr, false_hits, false_holes, coverage = {}, {}, {}, {}
+    for degrees in (5, 20, 40):
+        target = orbit(eye, degrees, 2.8)
+        truth, target_depth = taken(target)
+        drawn, alpha = run(image, depth, eye, target)
+        seen, shown = visible(depth, eye, target, target_depth), np.asarray(alpha) > 0
+        error = np.mean((np.asarray(drawn) - truth)[seen & shown] ** 2)
+        psnr[degrees] = -10 * np.log10(error)
+        false_hits[degrees] = np.mean(shown & ~seen)
+        false_holes[degrees] = np.mean(seen & ~shown)
+        coverage[degrees] = np.mean(shown)
+    assert min(psnr.values()) > 20, psnr
+    assert max(false_hits.values()) < 0.015, false_hits
+    # What passes behind a near thing counts as unseen, though it may come out again.
+    assert max(false_holes.values()) < 0.35, false_holes
+    assert coverage[5] > 0.6 > coverage[20] > coverage[40]
+
+
+def smooth_depth():
+    y, x = np.mgrid[:24, :32] / 24
+    return 2 + 0.1 * np.sin(4 * x) * np.cos(3 * y)
+
+
+def test_derivatives_of_the_pose_and_the_depth_are_the_difference_quotients():
+    image, depth = picture(), smooth_depth()
+    source = camera()
+
+    def drawn(move, depth):
+        pose = camera(at=(0.1, 0.05, 0.1), turn=0.03).world_from_camera.at[:3, 3].add(move)
+        target = PinholeCamera(source.intrinsics, pose)
+        return run(image, depth, source, target)[0][6:18, 8:24]
+
+    rng = np.random.default_rng(0)
+    for along in (
+        (jnp.array([1.0, 0.5, -0.7]), jnp.zeros((24, 32))),
+        (jnp.zeros(3), jnp.asarray(rng.normal(size=(24, 32)))),
+    ):
+        at = (jnp.zeros(3), jnp.asarray(depth))
+        value, pushed = jax.jvp(drawn, at, along)
+        step = lambda s, along=along: drawn(s * along[0], depth + s * along[1])
+        quotient = (step(1e-6) - step(-1e-6)) / 2e-6
+        close = np.isclose(pushed, quotient, rtol=1e-4, atol=1e-5)
+        # A few pixels read across the border of a patch.
+        assert close.mean() > 0.98
+        weight = jnp.asarray(rng.normal(size=value.shape))
+        pulled = jax.vjp(drawn, *at)[1](weight)
+        one = sum(jnp.vdot(p, v) for p, v in zip(pulled, along, strict=True))
+        assert float(one) == pytest.approx(float(jnp.vdot(weight, pushed)), rel=1e-9)
+
+
+def test_under_vmap_and_in_any_shape():
+    image, depth = picture(), smooth_depth()
+    moves = jnp.array([[0.1, 0, 0], [0, 0.2, 0.1]])
+
+    def drawn(move):
+        pose = jnp.eye(4).at[:3, 3].add(move)
+        target = PinholeCamera(camera(5, 7).intrinsics, pose)
+        return run(image, depth, camera(), target, shape=(5, 7))
+
+    images, alphas = jax.vmap(drawn)(moves)
+    assert images.shape == (2, 5, 7, 3) and alphas.shape == (2, 5, 7)
+    for move, image_, alpha in zip(moves, images, alphas, strict=True):
+        one, mask = drawn(move)
+        np.testing.assert_allclose(image_, one, atol=1e-12)
+        np.testing.assert_array_equal(alpha, mask)
+
+
+FAULTS = {
+    "warp(image)": {"image": np.ones((4, 4))},
+    "warp(depth)": {"depth": np.ones((4, 5))},
+    "warp(source)": {"source": OrthographicCamera(1.0, [0.0, 0.0], np.eye(4))},
+    "warp(target)": {"target": None},
+    "warp(shape=...)": {"shape": (0, 3)},
+    "warp(method=...)": {"method": "fast"},
+    "warp(hole_threshold=...)": {"hole_threshold": 0},
+}
+
+
+@pytest.mark.parametrize(("name", "fault"), FAULTS.items(), ids=FAULTS)
+def test_bad_arguments_are_named(name, fault):
+    given = {
+        "image": picture(),
+        "depth": smooth_depth(),
+        "source": camera(),
+        "target": camera(),
+    }
+    with pytest.raises(ValueError, match=re.escape(f"`{name}`")):
+        inspect.unwrap(warp)(**given | fault)

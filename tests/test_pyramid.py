@@ -1,0 +1,35 @@
+"""Pyramids of any size, against the definition."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx._pyramid import maximum_pyramid, minimum_pyramid
+
+
+SIZES = [(1, 1), (1, 2), (2, 3), (5, 1), (17, 5), (61, 64), (64, 257)]
+
+
+@pytest.mark.parametrize("size", SIZES, ids="{0[0]}x{0[1]}".format)
+@pytest.mark.parametrize(
+    ("pyramid", "extreme"), [(minimum_pyramid, np.min), (maximum_pyramid, np.max)]
+)
+def test_each_texel_is_the_extreme_of_what_it_covers(pyramid, extreme, size):
+    depth = np.random.default_rng(0).normal(size=size)
+    made = pyramid(jnp.asarray(depth))
+    for k in range(len(made.shapes)):
+        side = 2**k
+        level = made.level(k)
+        assert level.shape == made.shapes[k] == tuple(-(-n // side) for n in size)
+        for j, i in np.ndindex(*level.shape):
+            covered = depth[j * side : (j + 1) * side, i * side : (i + 1) * side]
+            assert level[j, i] == extreme(covered)
+    assert made.shapes[-1] == (1, 1)
+    assert len(made.values) == made.offsets[-1] + 1
+
+
+def test_infinite_texels_stay():
+    depth = np.full((3, 3), np.inf)
+    depth[2, 2] = 1.0
+    made = minimum_pyramid(jnp.asarray(depth))
+    np.testing.assert_array_equal(made.level(1), [[np.inf, np.inf], [np.inf, 1.0]])
