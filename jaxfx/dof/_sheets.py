@@ -20,12 +20,14 @@ import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float, Int
 
-from jaxfx.dof._sprites import coverage, row_half_width, segment_integral
-from jaxfx.dof._tiles import NEAR, RUN, _runs, _tile_reaches
+from jaxfx.dof._sprites import POINT_RADIUS, coverage, row_half_width, segment_integral
+from jaxfx.dof._tiles import _tile_reaches
 
 
 # Small enough for the cache to hold the weights of a run.
 TILE = (16, 128)
+# A row of taps is worked through in runs; the middle one goes as far as NEAR to both sides.
+RUN, NEAR = 17, 8
 # Below this `shifted` is quick enough, and compiles sooner than `tiled`.
 FEW_TAPS = 2**21
 
@@ -72,12 +74,16 @@ def _arriving(there, cover, here, x, y):
     return cover * _clip(facing, 0, 2), _clip(difference - explained, -1, 1)
 
 
-def _add(sums, arriving, values, throughs, own_cover):
+def _sorted(weight, place):
+    """A weight's parts in front, on the surface and behind, and the share in front."""
+    front, behind = jnp.where(place < 0, -place, 0), jnp.where(place < 0, 0, place)
+    return (weight * front, weight * (1 - front - behind), weight * behind), front
+
+
+def _add(sums, parts, values, throughs, own_cover):
     """What the sprites of all sheets at one offset add to the `Sums`."""
     light, covered = sums.light, 1.0
-    for (weight, place), value, through in zip(arriving, values, throughs, strict=True):
-        front, behind = jnp.where(place < 0, -place, 0), jnp.where(place < 0, 0, place)
-        shares = (weight * front, weight * (1 - front - behind), weight * behind)
+    for (shares, front), value, through in zip(parts, values, throughs, strict=True):
         light = [x + share[None] * value for x, share in zip(light, shares, strict=True)]
         # Where the first sheet is in front the second may show the surface all the same.
         covered = covered * (1 - through * (1 - front))
@@ -125,12 +131,12 @@ def shifted(reach: int, sheets: list[Sheet]) -> Sums:
             own_cover = coverage(own_span, x) / own_area
             covers = [coverage(each, x) for each in span]
             x_, y_ = (each.astype(own_area.dtype) for each in (x, y))
-            arriving = [
-                _arriving(sheet, cover, here, x_, y_)
+            parts = [
+                _sorted(*_arriving(sheet, cover, here, x_, y_))
                 for sheet, cover in zip(there, covers, strict=True)
             ]
             values, throughs = [s.value for s in there], [s.through for s in there]
-            return _add(sums, arriving, values, throughs, own_cover), None
+            return _add(sums, parts, values, throughs, own_cover), None
 
         return jax.lax.scan(jax.checkpoint(add_tap), sums, offsets)
 
@@ -223,29 +229,61 @@ def _add_run(sums, run, here, own_width, own_area, first, y):
     there, _ = run
     y = y.astype(own_area.dtype)
 
-    def weigh(_, k):
-        sheets, widths = _cut(run, 0, k, tall, wide)
-        x = (first + k).astype(own_area.dtype)
-        return None, [
-            _arriving(sheet, _covered(span, x), here, x, y)
-            for sheet, span in zip(sheets, widths, strict=True)
-        ]
+    def weigh():
+        found = []
+        for k in range(RUN):
+            sheets, widths = _cut(run, 0, k, tall, wide)
+            x = (first + k).astype(own_area.dtype)
+            found.append(
+                [
+                    _arriving(sheet, _covered(span, x), here, x, y)
+                    for sheet, span in zip(sheets, widths, strict=True)
+                ]
+            )
+        return found
 
-    arriving = jax.lax.scan(weigh, None, jnp.arange(RUN))[1]
-    for k in range(RUN):
-        at = slice(k, k + wide)
-        own_cover = _covered(own_width, (first + k).astype(own_area.dtype)) / own_area
-        sums = _add(
-            sums,
-            [(weight[k], place[k]) for weight, place in arriving],
-            [sheet.value[..., at] for sheet in there],
-            [sheet.through[..., at] for sheet in there],
-            own_cover,
-        )
-    return sums
+    shapes = jax.eval_shape(weigh)
+    zeros = lambda: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    # A branch is a border that XLA fuses nothing across.
+    found = jax.lax.cond(y < 1e6, weigh, zeros)
+    arriving = [([f[n][0] for f in found], [f[n][1] for f in found]) for n in range(len(there))]
+    own = [(first + k).astype(own_area.dtype) for k in range(RUN)]
+    own = [_covered(own_width, x) / own_area for x in own]
+    at = [slice(k, k + wide) for k in range(RUN)]
+
+    def one_surface(sums):
+        front, same, behind = sums.light
+        for k in range(RUN):
+            for sheet, (weight, _) in zip(there, arriving, strict=True):
+                same = same + weight[k][None] * sheet.value[..., at[k]]
+        return Sums((front, same, behind), sums.open + sum(own))
+
+    def several(sums):
+        for k in range(RUN):
+            sums = _add(
+                sums,
+                [_sorted(weight[k], place[k]) for weight, place in arriving],
+                [sheet.value[..., at[k]] for sheet in there],
+                [sheet.through[..., at[k]] for sheet in there],
+                own[k],
+            )
+        return sums
+
+    apart = [jnp.abs(p) for _, place in arriving for p in place]
+    mixed = ft.reduce(jnp.maximum, apart).max() > 0
+    return jax.lax.cond(mixed, several, one_surface, sums)
 
 
 def _covered(span, x):
     """`_sprites.coverage`, by comparisons that compile to one instruction each."""
     x = jnp.abs(x)
     return _clip(jnp.where(x > 0, span + (0.5 - x), 2 * span), 0, 1)
+
+
+def _runs(reach, row):
+    """How many runs beyond the middle one a disc of that reach covers in a row, to a side."""
+    radius = reach.astype(jnp.float32) + POINT_RADIUS
+    height = jnp.maximum(row.astype(jnp.float32) - 0.5, 0)
+    half_chord = jnp.sqrt(jnp.maximum((radius - height) * (radius + height), 0))
+    columns = jnp.ceil(half_chord - 0.5 + 1e-3).astype(int)
+    return jnp.maximum(0, (columns - NEAR + RUN - 1) // RUN)
