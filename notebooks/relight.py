@@ -1,0 +1,358 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Relighting from a deep frame buffer
+#
+# What no light changes is kept for every pixel: reflectances, normal, depth, roughness, the
+# shader. A change of light shades those again. The cost follows the picture's size, not the
+# scene's.
+
+# %%
+import io
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+from PIL import Image
+
+from jaxfx import GBuffer, PinholeCamera, PointLight, exr, metrics, relight, scene
+
+
+# The scenes that the benchmarks use, whichever folder this runs in.
+root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "tests/benchmarks").is_dir())
+sys.path.append(str(root / "tests/benchmarks"))
+import relight_scenes
+
+
+set_matplotlib_formats("jpeg", pil_kwargs={"quality": 80})
+plt.rcParams |= {"figure.dpi": 80, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}
+show = lambda image: np.asarray(exr.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
+
+
+def pictures(titled, columns, width=10):
+    rows = -(-len(titled) // columns)
+    _, axes = plt.subplots(
+        rows, columns, figsize=(width, width / columns * rows * 0.86), layout="constrained"
+    )
+    for ax in np.ravel(axes):
+        ax.set_axis_off()
+    for ax, (title, image) in zip(np.ravel(axes), titled.items(), strict=False):
+        flat = np.ndim(image) == 2
+        ax.imshow(image if flat else show(image), cmap="viridis" if flat else None)
+        ax.set_title(title)
+    plt.show()
+
+
+mesh = scene.still_life()
+SIZE = {"height": 240, "width": 320}
+camera = scene.default_camera(mesh, **SIZE)
+gbuffer = scene.gbuffer(mesh, camera, **SIZE)
+pictures(
+    {
+        "color": gbuffer.color,
+        "shader": gbuffer.shader,
+        "ambient": gbuffer.ambient,
+        "diffuse": gbuffer.diffuse,
+        "specular, 10 times": 10 * gbuffer.specular,
+        "normal": (gbuffer.normal + 1) / 2,
+        "1 / depth": 1 / gbuffer.depth,
+        "roughness": gbuffer.roughness,
+    },
+    4,
+)
+
+# %% [markdown]
+# ## One light of many
+#
+# A pixel is $\sum_k E_k\,(\rho_d \max(N\cdot L_k, 0) + \rho_s h_k)$. The state keeps the two
+# sums over $k$, without the reflectances $\rho$. So an edit takes out what the old light
+# brought and puts in the new, and a change of reflectance touches no light.
+
+# %%
+lights = [*scene.default_lights(camera), PointLight([0.5, 1.2, -1.5], [1.5, 0.6, 0.3])]
+state = relight.start(gbuffer, camera, lights)
+moved = state.edit(3, PointLight([-0.6, 1.3, -2.5], [0.4, 1.0, 2.5]))
+floor = (scene.material_ids(mesh, camera, **SIZE) == 0) & (gbuffer.shader >= 0)
+pictures(
+    {
+        "four lights": state.image,
+        "one of them edited": moved.image,
+        "without the key light": moved.remove(0).image,
+        "and one material painted": moved.paint(floor, color=np.array([0.1, 0.5, 0.3])).image,
+    },
+    4,
+)
+
+# %% [markdown]
+# Ten thousand edits in turn of two lights, one a million times as bright as the other, in
+# float32. A plain sum would keep what it lost each time.
+
+# %%
+faint, glaring = PointLight([0, 1, -1], [1, 1, 1]), PointLight([0, 1, -1], [1e6, 1e6, 1e6])
+small = jax.tree.map(lambda image: image[::16, ::16], gbuffer)
+small_camera = scene.default_camera(mesh, height=15, width=20)
+
+
+@jax.jit
+def chain(state, plain):
+    def step(carry, _):
+        state, plain = carry
+        for old, new in ((faint, glaring), (glaring, faint)):
+            state = state.edit(0, new)
+            plain = plain - relight.shade(small, small_camera, old)
+            plain = plain + relight.shade(small, small_camera, new)
+        return (state, plain), None
+
+    (state, plain), _ = jax.lax.scan(step, (state, plain), None, length=5_000)
+    return state.image, plain
+
+
+other = PointLight([0.3, 1.5, -2], [2, 2, 2])
+kept = relight.start(small, small_camera, [faint, other])
+fresh = relight.render(small, small_camera, [faint, other])
+kept_image, plain_image = chain(kept, fresh)
+for name, image in (("kept", kept_image), ("plain", plain_image)):
+    print(f"{name:6} off by {float(jnp.max(jnp.abs(image - fresh)) / jnp.max(fresh)):.1e}")
+
+# %% [markdown]
+# ## A light on sliders
+#
+# 640 x 480. In a live notebook the picture follows the sliders; the printed figure is the time
+# from a slider's value to the bytes of the picture.
+
+# %%
+import ipywidgets as widgets
+
+
+large, large_camera = relight_scenes.cache((480, 640))
+live = relight.start(
+    large,
+    large_camera,
+    [*scene.default_lights(large_camera)[1:], PointLight([0, 1, -2], [1] * 3)],
+)
+to_bytes = jax.jit(
+    lambda image: jnp.round(
+        255
+        * jnp.where(
+            image <= 0.0031308,
+            12.92 * image,
+            1.055 * jnp.clip(image, 0.0031308, 1) ** (1 / 2.4) - 0.055,
+        )
+    ).astype(jnp.uint8)
+)
+
+
+def picture(x, y, z, strength):
+    """The picture with the light there, as JPEG."""
+    color = np.array([1.0, 0.85, 0.6], np.float32) * strength
+    light = PointLight(np.array([x, y, z], np.float32), color)
+    stream = io.BytesIO()
+    pixels = np.asarray(to_bytes(live.edit(2, light).image))
+    Image.fromarray(pixels).save(stream, "JPEG", quality=85)
+    return stream.getvalue()
+
+
+slider = lambda value, low, high: widgets.FloatSlider(value, min=low, max=high, step=0.05)
+sliders = {
+    "x": slider(0.3, -1.5, 1.5),
+    "y": slider(1.1, 0.2, 2.0),
+    "z": slider(-1.8, -3.5, -0.5),
+    "strength": slider(2.0, 0.0, 6.0),
+}
+view = widgets.Image(format="jpeg")
+
+
+def answer(_=None):
+    view.value = picture(**{name: each.value for name, each in sliders.items()})
+
+
+for name, each in sliders.items():
+    each.description = name
+    each.observe(answer, "value")
+answer()
+times = []
+for value in np.linspace(-1, 1, 21):
+    started = time.perf_counter()
+    sliders["x"].value = float(value)
+    times.append(1e3 * (time.perf_counter() - started))
+print(f"{statistics.median(times):.0f} ms from slider to picture (median of {len(times)})")
+widgets.VBox([view, *sliders.values()])
+
+# %% [markdown]
+# ## New views
+#
+# A pixel of the new view and its depth are a point of the world; each cache that sees it, by
+# depth, normal and shader, has its say; their mean is the new cache. What no cache sees is a
+# hole.
+
+# %%
+target, depth, gbuffers, cameras = relight_scenes.new_view((240, 320), 4)
+found, coverage = relight.synthesize(gbuffers, cameras, target, depth=depth)
+filled, count = relight.fill_holes(found, coverage)
+truth = scene.gbuffer(mesh, target, **SIZE)
+lights = scene.default_lights(target)
+image, filled_image, true_image = (
+    relight.render(each, target, lights) for each in (found, filled, truth)
+)
+pictures(
+    {
+        "how many caches see it": coverage,
+        f"{int(count)} pixels of holes": image,
+        f"filled: {float(metrics.psnr(filled_image, true_image)):.1f} dB": filled_image,
+        "its error, 4 times": 4 * jnp.abs(filled_image - true_image),
+    },
+    4,
+)
+
+# %% [markdown]
+# Against the new view's own cache, by the angle to the nearest cache and their number. Weights
+# by detail change little: caches are read at the nearest pixel, which is off by up to half of
+# one in each.
+
+# %%
+look = mesh.viewpoint
+small_size = {"height": 120, "width": 160}
+
+
+def orbit(degrees, rise=0.0):
+    angle = np.radians(degrees)
+    turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    eye = np.array(look.target) + turn @ (np.array(look.eye) - look.target) + [0, rise, 0]
+    return PinholeCamera.look_at(eye, look.target, up=[0, 1, 0], fov_y=look.fov, **small_size)
+
+
+stations = [(0, 0), (-8, 0.1), (0, 0.3), (-4, -0.2), (-12, 0.3), (-16, 0), (4, 0.2), (2, -0.2)]
+cameras = [orbit(*station) for station in stations]
+gbuffers = [scene.gbuffer(mesh, each, **small_size) for each in cameras]
+angles = [5, 10, 20, 30]
+figure, axes = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
+for number in (1, 2, 4, 8):
+    for weights in ("equal", "detail") if number in (2, 8) else ("equal",):
+        scores, seen = [], []
+        for degrees in angles:
+            target = orbit(degrees, 0.05)
+            truth = scene.gbuffer(mesh, target, **small_size)
+            found, coverage = relight.synthesize(
+                gbuffers[:number], cameras[:number], target, depth=truth.depth, weights=weights
+            )
+            filled, _ = relight.fill_holes(found, coverage)
+            lights = scene.default_lights(target)
+            pair = (relight.render(each, target, lights) for each in (filled, truth))
+            scores.append(float(metrics.psnr(*pair)))
+            seen.append(float(jnp.mean(coverage > 0) / jnp.mean(truth.shader >= 0)))
+        label = f"{number}" + (", by detail" if weights == "detail" else "")
+        axes[0].plot(angles, scores, ".-" if weights == "equal" else "x:", label=label)
+    axes[1].plot(angles, seen, ".-", label=f"{number}")
+axes[0].set(xlabel="degrees from the nearest cache", ylabel="PSNR of the relit picture, dB")
+axes[1].set(xlabel="degrees from the nearest cache", ylabel="share of the view that is seen")
+axes[0].legend(title="caches")
+plt.show()
+
+# %% [markdown]
+# ## Why caches are not antialiased
+#
+# The mean of two surfaces' normals and depths is a third surface, between them. Sixteen samples
+# a pixel, averaged after shading and before:
+
+# %%
+FINE = 4
+fine_size = {name: FINE * side for name, side in small_size.items()}
+fine_camera = scene.default_camera(mesh, **fine_size)
+fine = scene.gbuffer(mesh, fine_camera, **fine_size)
+coarse_camera = scene.default_camera(mesh, **small_size)
+lights = scene.default_lights(coarse_camera)
+
+
+def shrunk(image):
+    rows, columns = (side // FINE for side in image.shape[:2])
+    return jnp.mean(image.reshape(rows, FINE, columns, FINE, *image.shape[2:]), axis=(1, 3))
+
+
+middle = lambda image: image[FINE // 2 :: FINE, FINE // 2 :: FINE]
+depth = jnp.where(jnp.isfinite(fine.depth), fine.depth, 20.0)
+averaged = {
+    name: shrunk(depth if name == "depth" else getattr(fine, name))
+    for name in ("color", "ambient", "diffuse", "specular", "normal", "depth", "roughness")
+}
+antialiased = GBuffer(shader=middle(fine.shader), **averaged)
+supersampled = shrunk(relight.render(fine, fine_camera, lights))
+wrong = relight.render(antialiased, coarse_camera, lights)
+one = relight.render(scene.gbuffer(mesh, coarse_camera, **small_size), coarse_camera, lights)
+ids = scene.object_ids(mesh, fine_camera, **fine_size).reshape(120, FINE, 160, FINE)
+edges = jnp.max(ids, axis=(1, 3)) != jnp.min(ids, axis=(1, 3))
+score = lambda image: float(metrics.psnr(image, supersampled, mask=edges))
+pictures(
+    {
+        "shaded, then averaged": supersampled,
+        f"averaged first: {score(wrong):.1f} dB at edges": wrong,
+        f"one sample: {score(one):.1f} dB at edges": one,
+        "averaging first: 4 times the error": 4 * jnp.abs(wrong - supersampled),
+    },
+    4,
+)
+
+# %% [markdown]
+# ## Against rendering anew
+#
+# The same picture from the mesh: Embree finds what each pixel shows, and one shadow ray goes to
+# each light. The ratio grows with the lights, for an edit does not know how many there are.
+
+
+# %%
+def median(function, rounds):
+    jax.block_until_ready(function())
+    times = []
+    for _ in range(rounds):
+        started = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+counts = (1, 10, 100)
+figure, ax = plt.subplots(figsize=(6, 3), layout="constrained")
+for side in (120, 240, 480):
+    size = (side, side * 4 // 3)
+    cached, at = relight_scenes.cache(size)
+    ratios = []
+    for number in counts:
+        lights = relight_scenes.lights(number)
+        lit = [jnp.ones(size, jnp.float32)] * number
+        state = relight.start(cached, at, lights, visibilities=lit)
+        edit = median(lambda s=state, o=lights[0], v=lit[0]: s.edit(0, o, v).image, 5)
+        anew = lambda o=lights, c=at, s=size: relight_scenes.rendered_anew(mesh, c, o, s)
+        ratios.append(median(anew, 1) / edit)
+    ax.loglog(counts, ratios, ".-", label=f"{size[1]} x {size[0]}")
+ax.axhline(100, color="0.5", linestyle=":")
+ax.set(xlabel="lights with shadows", ylabel="times as fast")
+ax.legend()
+plt.show()
+
+# %% [markdown]
+# ## What it cannot do
+#
+# - Light that comes by way of another surface, reflections and refractions: a pixel knows one
+#   surface.
+# - Shadows of its own: `visibility` is the caller's, of `jaxfx.shadow` say.
+# - Transparency, motion blur, defocus: a cache is not antialiased. Take it finer, shade, then
+#   average.
+# - Texture finer than a cache's pixels in a new view, and what no cache saw there: holes are
+#   filled with their neighbours.
+# - Two surfaces nearer than the tolerance, of one shader and one normal, can blend in a new
+#   view where no cache fits better than another.
