@@ -133,29 +133,40 @@ def test_a_second_layer_that_is_nowhere_is_none():
     assert np.abs(two_layers(image, depth, nowhere) - same).max() < 1e-12
 
 
-@pytest.mark.parametrize("sheets", [1, 2])
-def test_tiles_give_the_sums_of_shifts(sheets):
-    """Several tiles, their last ones cut off, and sprites that reach beyond a run of taps."""
-    size, coc = (37, 150), 30.0
-    rng = np.random.default_rng(6)
-    planes = [
+def random_sheets(count, size, largest, seed=6):
+    rng = np.random.default_rng(seed)
+    normal = lambda *shape: jnp.asarray(rng.normal(size=(*shape, *size)))
+    return [
         _sheets.Sheet(
             value=jnp.asarray(rng.uniform(0, 1, (2, *size))),
-            radius=jnp.asarray(np.where(rng.random(size) < 0.02, 14.9, 0.6)),
+            radius=jnp.asarray(np.where(rng.random(size) < 0.02, largest, 0.6)),
             through=jnp.asarray(rng.uniform(0, 1, size)),
-            defocus=jnp.asarray(rng.normal(size=size)),
-            slope=jnp.asarray(rng.normal(size=(2, *size))) / 9,
-            tilt=jnp.asarray(rng.normal(size=(2, *size))) / 9,
+            defocus=normal(),
+            slope=normal(2) / 9,
+            tilt=normal(2) / 9,
         )
-        for _ in range(sheets)
+        for _ in range(count)
     ]
-    reach = int(coc / 2)
-    for x, y in zip(
-        jax.tree.leaves(_sheets.tiled(reach, planes)),
-        jax.tree.leaves(_sheets.shifted(reach, planes)),
-        strict=True,
-    ):
+
+
+def assert_close(one, other):
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_tiles_give_the_sums_of_shifts(count):
+    """Several tiles, their last ones cut off, and sprites that reach beyond a run of taps."""
+    sheets = random_sheets(count, (37, 150), 14.9)
+    assert_close(_sheets.tiled(15, sheets), _sheets.shifted(15, sheets))
+
+
+def test_tiles_have_the_derivatives_of_shifts():
+    sheets = random_sheets(2, (9, 10), 2.4)
+    out, pull = jax.vjp(lambda sheets: _sheets._by_tiles(2, sheets), sheets)
+    expected, pull_expected = jax.vjp(lambda sheets: _sheets.shifted(2, sheets), sheets)
+    assert_close(out, expected)
+    assert_close(pull(out), pull_expected(out))
 
 
 def test_the_gradient_of_an_edge_is_the_difference_quotient():
