@@ -58,8 +58,8 @@ def layered(
 
     What it does badly: what no layer shows is guessed from its surroundings, as is what lies
     beyond the frame, where the last pixels are repeated. Of several surfaces in front of q, or
-    behind it, the mean is taken. A surface narrower than two pixels has no slope. The time grows
-    with the square of the radius, as that of `scatter(kernel="tiles")` does.
+    behind it, the mean is taken. A surface narrower than two pixels has no slope. The time
+    grows with the square of the radius, as that of `scatter(kernel="tiles")` does.
 
     **Arguments:**
 
