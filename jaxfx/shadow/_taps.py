@@ -2,7 +2,7 @@
 
 A texel outside the map is as far as can be, so that all is lit that is compared with it. A
 receiver that is lit whatever the map says reads such texels only. Then no filter has a case to
-tell apart: it reads `texels[place.texel + offset]` and compares with `place.threshold`.
+tell apart: it reads the texels about each place and compares them with its threshold.
 """
 
 from typing import Any, Literal, NamedTuple, get_args
@@ -19,26 +19,22 @@ Kernel = Literal["box", "tent", "gaussian"]
 
 # Filters of up to so many rows are written out; larger ones loop over rows to compile sooner.
 _UNROLLED = 9
+# Rows of texels are read in multiples of so many.
+LANES = 8
 
 
 class Places(NamedTuple):
     """Receivers as places in the padded map, an array of any one shape.
 
-    `texel` is the one that holds the receiver, `dx` and `dy` lead from its centre to the
-    receiver, in texels; what is nearer to the light than `threshold` shadows it.
+    `row` and `column` are those of the texel that holds the receiver, `dx` and `dy` lead from
+    its centre to the receiver, in texels; what is nearer to the light than `threshold` shadows.
     """
 
-    texel: Int[Array, "*place"]
+    row: Int[Array, "*place"]
+    column: Int[Array, "*place"]
     threshold: Float[Array, "*place"]
     dx: Float[Array, "*place"]
     dy: Float[Array, "*place"]
-
-
-class Texels(NamedTuple):
-    """A padded map, row after row, and the length of a row."""
-
-    flat: Float[Array, " texel"]
-    stride: int
 
 
 def check_size(function: str, size: Any) -> int:
@@ -90,15 +86,26 @@ def check_bias(function: str, bias: Any, slope_bias: Any) -> tuple[Array, Array]
     return bias, slope_bias
 
 
+def without_gradient(softness: Any, kernel: Kernel, data: Any) -> Any:
+    """The data of a filter, constant where its result is a step of them."""
+    is_step = softness is None and kernel == "box"
+    return jax.lax.stop_gradient(data) if is_step else data
+
+
 def common_dtype(shadow_map: Array, receivers: Receivers) -> jnp.dtype:
     return working_dtype(shadow_map.dtype, *(field.dtype for field in receivers))
 
 
-def pad_map(shadow_map: Float[Array, "rows columns"], size: int, dtype: Any) -> Texels:
-    """The map with `size` texels that are infinitely far all around; NaN is infinitely far."""
+def pad_map(
+    shadow_map: Float[Array, "rows columns"], size: int, dtype: Any
+) -> Float[Array, "texels_down texels_across"]:
+    """The map with `size` texels that are infinitely far all around; NaN is infinitely far.
+
+    A few more on the right are there to be read, not compared, by vector units.
+    """
     known = jnp.where(jnp.isnan(shadow_map), jnp.inf, shadow_map).astype(dtype)
-    padded = jnp.pad(known, size, constant_values=jnp.inf)
-    return Texels(padded.reshape(-1), padded.shape[1])
+    widths = ((size, size), (size, size + LANES - 1))
+    return jnp.pad(known, widths, constant_values=jnp.inf)
 
 
 def find_places(
@@ -112,8 +119,6 @@ def find_places(
     """The receivers in a map of `shape` that `pad_map` padded for filters of `size`."""
     u, v, z, slope = (field.astype(dtype) for field in receivers)
     threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
-    # Computed once: the mask and the filter must agree on it to the last bit.
-    threshold = jax.lax.optimization_barrier(threshold)
     known = jnp.isfinite(u) & jnp.isfinite(v) & jnp.isfinite(threshold) & (z > 0)
     u, v = jnp.where(known, u, -size), jnp.where(known, v, -size)
     threshold = jnp.where(known, threshold, 0)
@@ -124,8 +129,7 @@ def find_places(
         (jnp.clip(each, -reach - 1, count + reach) + size).astype(jnp.int32)
         for each, count in ((x, shape[1]), (y, shape[0]))
     )
-    texel = row * (shape[1] + 2 * size) + column
-    return Places(texel, threshold, u - x - 0.5, v - y - 0.5)
+    return Places(row, column, threshold, u - x - 0.5, v - y - 0.5)
 
 
 def lit(

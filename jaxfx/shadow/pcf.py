@@ -1,6 +1,7 @@
 """Shadow-map comparison: alone, after filtering, and before it (percentage closer)."""
 
 import functools as ft
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfx.shadow import _taps
-from jaxfx.shadow._taps import Kernel, Places, Texels
+from jaxfx.shadow._taps import Kernel, Places
 from jaxfx.shadow.receivers import Receivers
+
+
+Texels = Float[Array, "texels_down texels_across"]
+
+# Smaller filters are read tap by tap.
+_LEAST_WINDOW = 5
 
 
 def hard(
@@ -44,7 +51,7 @@ def hard(
     """
     shadow_map, receivers = _taps.check_data("hard", shadow_map, receivers)
     biases = _taps.check_bias("hard", bias, slope_bias)
-    return jax.lax.stop_gradient(_pcf(shadow_map, receivers, *biases, None, 1, "box"))
+    return jax.lax.stop_gradient(filtered(shadow_map, receivers, *biases, None, 1, "box"))
 
 
 def prefiltered(
@@ -87,8 +94,7 @@ def _prefiltered(shadow_map, receivers, bias, slope_bias, size):
     places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
 
     def row(dy):
-        start = places.texel + dy * texels.stride
-        return sum(_read(texels, start + dx) for dx in _taps.taps(size))
+        return sum(read(texels, places, dx, dy) for dx in _taps.taps(size))
 
     mean = _taps.sum_rows(row, size) / size**2
     return _taps.lit(mean, places.threshold, None).astype(receivers.z.dtype)
@@ -138,11 +144,13 @@ def pcf(
     _taps.check_kernel("pcf", kernel)
     softness = _taps.check_softness("pcf", softness)
     biases = _taps.check_bias("pcf", bias, slope_bias)
-    return _pcf(shadow_map, receivers, *biases, softness, size, kernel)
+    data = _taps.without_gradient(softness, kernel, (shadow_map, receivers, *biases))
+    return filtered(*data, softness, size, kernel)
 
 
 @ft.partial(jax.jit, static_argnames=("size", "kernel"))
-def _pcf(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
+def filtered(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
+    """`pcf` of checked arguments."""
     dtype = _taps.common_dtype(shadow_map, receivers)
     texels = _taps.pad_map(shadow_map, size, dtype)
     places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
@@ -157,25 +165,24 @@ def average(
     kernel: Kernel,
 ) -> Float[Array, "*place"]:
     """The mean comparison of the taps about each place."""
+    if kernel == "box" and softness is None and size >= _LEAST_WINDOW:
+        return _share(texels, places, size)
 
-    def compared(index):
-        return _taps.lit(_read(texels, index), places.threshold, softness)
+    def compared(dx, dy):
+        return _taps.lit(read(texels, places, dx, dy), places.threshold, softness)
 
     if kernel == "box" or size == 1:
 
         def count(dy):
-            start = places.texel + dy * texels.stride
-            return sum(compared(start + dx) for dx in _taps.taps(size))
+            return sum(compared(dx, dy) for dx in _taps.taps(size))
 
-        return _taps.sum_rows(count, size) / size**2
+        return _mean(_taps.sum_rows(count, size), size)
 
     across = [_taps.weight(dx - places.dx, size, kernel) for dx in _taps.taps(size)]
 
     def row(dy):
-        start = places.texel + dy * texels.stride
-        weighted = sum(
-            w * compared(start + dx) for w, dx in zip(across, _taps.taps(size), strict=True)
-        )
+        pairs = zip(across, _taps.taps(size), strict=True)
+        weighted = sum(weight * compared(dx, dy) for weight, dx in pairs)
         down = jnp.asarray(dy).astype(places.dy.dtype) - places.dy
         weight = _taps.weight(down, size, kernel)
         return weight * weighted, weight
@@ -184,5 +191,27 @@ def average(
     return total / (down * sum(across))
 
 
-def _read(texels: Texels, index) -> Array:
-    return texels.flat.at[index].get(mode="promise_in_bounds")
+def read(texels: Texels, places: Places, dx: int, dy: Any) -> Float[Array, "*place"]:
+    """The texel so far from the one that holds each place."""
+    index = (places.row + dy) * texels.shape[1] + (places.column + dx)
+    return texels.reshape(-1).at[index].get(mode="promise_in_bounds")
+
+
+def _share(texels: Texels, places: Places, size: int) -> Float[Array, "*place"]:
+    """The share of lit taps, counted in whole windows: their rows are read as vectors."""
+    shape = places.row.shape
+    row, column, threshold = (each.reshape(-1) for each in places[:3])
+    wide = -(-size // _taps.LANES) * _taps.LANES
+    whole = jax.lax.GatherDimensionNumbers(
+        offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1)
+    )
+    corner = jnp.stack([row, column], axis=-1) - size // 2
+    window = jax.lax.gather(texels, corner, whole, (size, wide), mode="promise_in_bounds")
+    is_lit = (window >= threshold[:, None, None]) & (jnp.arange(wide) < size)[None, None]
+    count = jnp.sum(is_lit, axis=(1, 2), dtype=jnp.int32)
+    return _mean(count.astype(threshold.dtype), size).reshape(shape)
+
+
+def _mean(total: Float[Array, "*place"], size: int) -> Float[Array, "*place"]:
+    """The total over `size**2`; of all that can be, 1, whatever XLA makes of a division."""
+    return jnp.where(total == size**2, 1, total / size**2)

@@ -1,0 +1,88 @@
+"""Work on some pixels of many: as many as there are, without a capacity that could overflow.
+
+The pixels' bits are packed into words, whose counts are summed; then the place of the n-th set
+bit is found by halving, first among the words, then inside one. A loop does the pixels chunk by
+chunk, and ends with the last: where no bit is set, nothing is done.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+
+_BITS = 32
+_CHUNK = 4096
+_MANY = jnp.iinfo(jnp.int32).max
+
+
+def replace(
+    where: Bool[Array, " pixel"],
+    value: Float[Array, " pixel"],
+    fetch: Callable[[Int[Array, " chunk"]], Any],
+    compute: Callable[[Any], Float[Array, " chunk"]],
+) -> Float[Array, " pixel"]:
+    """`value`, with `compute(fetch(pixels))` in the pixels `where`, chunk by chunk.
+
+    What `fetch` gives is carried from step to step, which lays it out in memory: else XLA
+    would fetch it anew for each tap of `compute`.
+    """
+    words = _pack(where)
+    ends = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
+    chunk = min(_CHUNK, where.size)
+
+    def load(k):
+        rank = k * chunk + jnp.arange(chunk, dtype=jnp.int32)
+        pixels = jnp.where(rank < ends[-1], _nth_set(words, ends, rank), where.size)
+        return pixels, fetch(jnp.minimum(pixels, where.size - 1))
+
+    def step(k, carry):
+        (pixels, fetched), result = carry
+        new = compute(fetched)
+        result = result.at[pixels].set(new, mode="drop", unique_indices=True)
+        return load(k + 1), result
+
+    steps = (ends[-1] + chunk - 1) // chunk
+    return jax.lax.fori_loop(0, steps, step, (load(0), value))[1]
+
+
+def _pack(bits: Bool[Array, " pixel"]) -> UInt32[Array, " word"]:
+    padded = jnp.pad(bits, (0, -bits.size % _BITS)).reshape(-1, _BITS)
+    shifts = jnp.arange(_BITS, dtype=jnp.uint32)
+    return jnp.sum(padded.astype(jnp.uint32) << shifts[None], axis=1, dtype=jnp.uint32)
+
+
+def _nth_set(
+    words: UInt32[Array, " word"], ends: Int[Array, " word"], rank: Int[Array, " chunk"]
+) -> Int[Array, " chunk"]:
+    """The index of the bit that so many set ones stand before; anything beyond the last."""
+    at = jnp.minimum(_count_up_to(ends, rank), words.size - 1)
+    word = words[at]
+    rank = rank - (ends[at] - jax.lax.population_count(word).astype(jnp.int32))
+    bit = jnp.zeros_like(rank)
+    for half in (16, 8, 4, 2, 1):
+        low = word & jnp.uint32((1 << half) - 1)
+        before = jax.lax.population_count(low).astype(jnp.int32)
+        is_above = rank >= before
+        rank = jnp.where(is_above, rank - before, rank)
+        word = jnp.where(is_above, word >> half, word)
+        bit = jnp.where(is_above, bit + half, bit)
+    return at * _BITS + bit
+
+
+def _count_up_to(ends: Int[Array, " word"], rank: Int[Array, " chunk"]) -> Int[Array, " chunk"]:
+    """How many of the ascending `ends` are `rank` or less.
+
+    Among every root-th of them first, then among the root that follow: halving would take more
+    steps, each a kernel of its own.
+    """
+    root = math.isqrt(ends.size - 1) + 1
+    table = jnp.pad(ends, (0, root * root - ends.size), constant_values=_MANY)
+    table = table.reshape(root, root)
+    block = jnp.sum(table[:, -1][None] <= rank[:, None], axis=1, dtype=jnp.int32)
+    block = jnp.minimum(block, root - 1)
+    inside = jnp.sum(table[block] <= rank[:, None], axis=1, dtype=jnp.int32)
+    return block * root + inside

@@ -1,0 +1,116 @@
+"""Cameras at lights, to make shadow maps with."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import check, normalize, parameter
+from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
+
+
+# The two world axes that a map's rows and columns follow on each face of a cube.
+_FACES = (
+    ((1, 0, 0), (0, 1, 0)),
+    ((-1, 0, 0), (0, 1, 0)),
+    ((0, 1, 0), (0, 0, 1)),
+    ((0, -1, 0), (0, 0, 1)),
+    ((0, 0, 1), (0, 1, 0)),
+    ((0, 0, -1), (0, 1, 0)),
+)
+
+
+def light_cameras(
+    light: Light,
+    *,
+    map_size: int,
+    centre: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    radius: Float[ArrayLike, ""] | float = 1.0,
+    margin: int = 0,
+) -> tuple[PinholeCamera | OrthographicCamera, ...]:
+    """The cameras that a light's shadow maps are made with.
+
+    One for a directional light, orthographic, that takes in a ball about the scene; one for a
+    spot light, as wide as its cone; six for a point light, on the faces of a cube; none for an
+    ambient one, which has no shadow. Six maps are used side by side:
+
+        cameras = shadow.light_cameras(light, map_size=512, margin=4)
+        maps = [scene.depth(mesh, c, height=512, width=512) for c in cameras]
+        seen = shadow.receivers(depth, camera, cameras)
+        visible = shadow.pcf(jnp.concatenate(maps, axis=1), seen, size=7)
+
+    **Arguments:**
+
+    - `light`: any of the four.
+    - `map_size`: static; height and width of a map, in pixels.
+    - `centre`, `radius`: the ball that holds the scene, 3 and a scalar, in scene units; a
+      directional light's camera stands two radii before the centre.
+    - `margin`: static; pixels by which each map is wider on each side than the ball, the cone
+      or the cube's face: half a filter's size, lest a filter reach past a face.
+
+    **Returns:** a tuple of cameras.
+
+    **Raises:** `ValueError` for a radius that is not positive, a margin that fills the map, or
+    a spot light's cone of pi or more.
+
+    **Gradient:** exact with respect to the light, `centre` and `radius`; zero along the light's
+    own roll, which is arbitrary, and at a direction of zero.
+
+    Source: Williams 1978; the cube is that of Greene 1986's environment maps.
+    """
+    if not 0 <= 2 * margin < map_size:
+        raise ValueError(
+            f"`light_cameras(margin=...)` must be 0 or more and below half of `map_size`, "
+            f"got {margin} of {map_size}."
+        )
+    centre = parameter("light_cameras(centre=...)", centre, (3,))
+    radius = parameter("light_cameras(radius=...)", radius)
+    check("light_cameras(radius=...)", radius, lambda v: v > 0, "positive")
+    inner = map_size - 2 * margin
+    if isinstance(light, AmbientLight):
+        return ()
+    if isinstance(light, DirectionalLight):
+        forward = normalize(light.direction)
+        pose = _pose(centre.astype(forward.dtype) - 2 * radius * forward, forward)
+        middle = [map_size / 2, map_size / 2]
+        return (OrthographicCamera(inner / (2 * radius), middle, pose),)
+    if isinstance(light, SpotLight):
+        check(
+            "light_cameras(light)",
+            light.outer_angle,
+            lambda v: v < jnp.pi / 2,
+            "a spot light whose `outer_angle` is below pi / 2",
+        )
+        pose = _pose(light.position, normalize(light.direction))
+        return (_pinhole(jnp.tan(light.outer_angle), inner, map_size, pose),)
+    if not isinstance(light, PointLight):
+        kind = type(light).__name__
+        raise ValueError(f"`light_cameras(light)` must be one of the four lights, got {kind}.")
+    one = jnp.ones_like(light.position[0])
+    poses = [
+        _pose(light.position, *(jnp.asarray(each, one.dtype) for each in f)) for f in _FACES
+    ]
+    return tuple(_pinhole(one, inner, map_size, pose) for pose in poses)
+
+
+def _pinhole(tangent: Float[Array, ""], inner: int, map_size: int, pose: Any) -> PinholeCamera:
+    """The camera whose `inner` pixels see `tangent` to either side."""
+    focal, half = inner / (2 * tangent), jnp.full_like(tangent, map_size / 2)
+    zero, one = jnp.zeros_like(tangent), jnp.ones_like(tangent)
+    rows = [[focal, zero, half], [zero, focal, half], [zero, zero, one]]
+    return PinholeCamera(jnp.stack([jnp.stack(row) for row in rows]), pose)
+
+
+def _pose(
+    eye: Float[Array, "3"], forward: Float[Array, "3"], up: Float[Array, "3"] | None = None
+) -> Float[Array, "4 4"]:
+    """At `eye`, looking `forward`; without `up`, rows follow the axis farthest from it."""
+    if up is None:
+        axis = jnp.argmin(jnp.abs(forward))
+        up = (jnp.arange(3) == axis).astype(forward.dtype)
+    right = normalize(jnp.cross(forward, up))
+    columns = [right, jnp.cross(forward, right), forward, eye.astype(forward.dtype)]
+    last = jnp.asarray([[0, 0, 0, 1]], forward.dtype)
+    return jnp.concatenate([jnp.stack(columns, axis=1), last])

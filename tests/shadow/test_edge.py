@@ -1,0 +1,198 @@
+"""Filtering only where it matters: which pixels, at what cost, and what is lost."""
+
+import functools as ft
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx import shadow
+from jaxfx.shadow import _compact
+from jaxfx.shadow._windows import extremes
+
+from .conftest import naive_pcf, random_case
+
+
+def steps_case(seed, dtype=np.float32):
+    """A map of a few flat depths with single texels among them: windows that agree exist."""
+    rng = np.random.default_rng(seed)
+    shadow_map = np.repeat(np.repeat(rng.choice([1.0, 2.0, np.inf], (4, 5)), 16, 0), 16, 1)
+    shadow_map[rng.integers(0, 64, 5), rng.integers(0, 80, 5)] = rng.uniform(0.5, 3, 5)
+    u, v = (rng.uniform(-6, count + 6, (40, 50)) for count in (80, 64))
+    z = rng.choice([-1.0, 1.0, 1.5, 2.0, 2.5, np.nan, np.inf], (40, 50))
+    fields = (u, v, z, rng.uniform(0, 0.2, (40, 50)))
+    return shadow_map.astype(dtype), shadow.Receivers(*(jnp.asarray(f, dtype) for f in fields))
+
+
+SIZES = [(size, np.float32) for size in (1, 3, 7, 15, 31)] + [(5, np.float64)]
+
+
+@pytest.mark.parametrize(("size", "dtype"), SIZES)
+def test_depth_mask_is_pcf_to_the_last_bit(size, dtype):
+    cases = [steps_case(seed, dtype) for seed in (0, 1)]
+    cases += [random_case(seed, (64, 80), (40, 50), dtype) for seed in (2, 3)]
+    for case in cases:
+        for slope_bias in (0.0, 0.7):
+            options = {"size": size, "bias": 0.013, "slope_bias": slope_bias}
+            visible = shadow.edge_pcf(*case, mask="depth", **options)
+            np.testing.assert_array_equal(visible, shadow.pcf(*case, **options))
+
+
+@pytest.mark.parametrize("kernel", ["box", "tent", "gaussian"])
+@pytest.mark.parametrize("softness", [None, 0.2])
+def test_depth_mask_is_pcf_in_every_form(kernel, softness):
+    case = steps_case(3)
+    options = {"size": 5, "kernel": kernel, "softness": softness, "bias": 0.02}
+    visible = shadow.edge_pcf(*case, mask="depth", **options)
+    np.testing.assert_allclose(visible, shadow.pcf(*case, **options), atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [3, 9])
+def test_depth_mask_is_where_the_comparisons_differ(size):
+    case = steps_case(4, np.float64)
+    found = shadow.candidates(*case, size=size, mask="depth")
+    share = naive_pcf(
+        case[0], case[1]._replace(z=np.where(np.isfinite(case[1].z), case[1].z, -1)), size
+    )
+    np.testing.assert_array_equal(found.where, (share > 0) & (share < 1))
+    assert int(found.comparisons) == 2 * share.size + int(found.where.sum()) * size**2
+
+
+def test_comparisons_are_counted_where_they_are_made():
+    """The loop visits every candidate once, and nothing else; none for a map without edges."""
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.001, 0.04, 0.5, 1.0):
+        where = jnp.asarray(rng.uniform(size=9001) < share)
+        visits = _compact.replace(
+            where,
+            jnp.zeros(9001),
+            lambda pixels: pixels,
+            lambda pixels: 1.0 + pixels.astype(float),
+        )
+        np.testing.assert_array_equal(visits, jnp.where(where, jnp.arange(1.0, 9002.0), 0))
+    ends = jnp.cumsum(jnp.asarray(rng.integers(0, 5, 77), jnp.int32)).astype(jnp.int32)
+    ranks = jnp.arange(int(ends[-1]), dtype=jnp.int32)
+    found = _compact._count_up_to(ends, ranks)
+    np.testing.assert_array_equal(found, np.searchsorted(ends, ranks, side="right"))
+
+
+def test_chunks_run_as_many_as_there_are_candidates():
+    calls = []
+
+    def compute(pixels):
+        jax.debug.callback(lambda: calls.append(1))
+        return pixels.astype(float)
+
+    size = 3 * _compact._CHUNK
+    for count, steps in ((0, 0), (1, 1), (_compact._CHUNK, 1), (_compact._CHUNK + 1, 2)):
+        calls.clear()
+        where = jnp.arange(size) < count
+        jax.block_until_ready(
+            _compact.replace(where, jnp.zeros(size), lambda pixels: pixels, compute)
+        )
+        jax.effects_barrier()
+        assert len(calls) == steps
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (6, 3), (20, 23)])
+@pytest.mark.parametrize("size", [1, 3, 7, 21])
+def test_running_extremes(shape, size):
+    image = np.random.default_rng(0).normal(size=shape)
+    smallest, largest = extremes(jnp.asarray(image), size)
+    half = size // 2
+    for j, i in np.ndindex(*shape):
+        window = image[max(j - half, 0) : j + half + 1, max(i - half, 0) : i + half + 1]
+        assert (smallest[j, i], largest[j, i]) == (window.min(), window.max())
+
+
+# The screen mask's losses: a wall at depth 2 with a floor at 4, seen at some magnification.
+
+
+def plate_case(magnification, width, side=96, texels=64):
+    """A floor under a plate of `width` texels; a pixel is `1 / magnification` texels."""
+    shadow_map = np.full((texels, texels), 5.0)
+    first = (texels - int(np.ceil(width))) // 2
+    shadow_map[:, first : first + int(np.ceil(width))] = 2.0
+    x = (np.arange(side) + 0.5 - side / 2) / magnification + texels / 2
+    u, v = np.meshgrid(x, x)
+    return shadow_map, shadow.Receivers(*map(jnp.asarray, (u, v, np.full_like(u, 4.0), 0 * u)))
+
+
+@pytest.mark.parametrize("magnification", [0.25, 0.5, 1.0, 2.0, 8.0])
+def test_screen_mask_with_enough_dilation_loses_no_wide_shadow(magnification):
+    case = plate_case(magnification, 16 if magnification < 8 else 6)
+    screen = shadow.edge_pcf(*case, size=7, mask="screen")
+    np.testing.assert_array_equal(screen, shadow.pcf(*case, size=7))
+
+
+def test_screen_mask_misses_less_the_farther_edges_reach():
+    case = plate_case(4.0, 4)
+    full = shadow.pcf(*case, size=7)
+    differing = [
+        int(jnp.sum(shadow.edge_pcf(*case, size=7, dilation=d) != full)) for d in (1, 4, 8, 16)
+    ]
+    assert differing == sorted(differing, reverse=True)
+    assert differing[0] > 96
+    assert differing[-1] == 0
+
+
+def test_screen_mask_loses_a_shadow_between_pixels():
+    """One texel wide, seen at a quarter: pixels step over it, so that it has no edge."""
+    shadow_map, receivers = plate_case(0.25, 1, side=16)
+    receivers = receivers._replace(u=receivers.u + 2.0)
+    assert (shadow.hard(shadow_map, receivers) == 1).all()
+    full = shadow.pcf(shadow_map, receivers, size=7)
+    assert full.min() < 1
+    assert (shadow.edge_pcf(shadow_map, receivers, size=7, dilation=3) == 1).all()
+    exact = shadow.edge_pcf(shadow_map, receivers, size=7, mask="depth")
+    np.testing.assert_array_equal(exact, full)
+
+
+def test_screen_mask_loses_an_edge_beyond_the_frame():
+    """The filter reaches the plate's ends, which the picture does not show."""
+    case = plate_case(8.0, 16)
+    assert (shadow.edge_pcf(*case, size=7) == 0).all()
+    assert shadow.pcf(*case, size=7).max() == pytest.approx(1 / 7)
+
+
+def test_nothing_to_filter_is_nothing_done(case):
+    lit = np.full_like(case[0], np.inf)
+    for mask in ("screen", "depth"):
+        found = shadow.candidates(lit, case[1], size=7, mask=mask)
+        assert not found.where.any()
+        assert found.comparisons == found.where.size * (2 if mask == "depth" else 1)
+        assert (shadow.edge_pcf(lit, case[1], size=7, mask=mask) == 1).all()
+
+
+@pytest.mark.parametrize("kernel", ["box", "tent"])
+def test_derivatives_are_pcfs(kernel):
+    shadow_map, receivers = random_case()
+    options = {"size": 3, "kernel": kernel}
+
+    def loss(function, shadow_map, z, bias, softness):
+        data = (shadow_map, receivers._replace(z=z))
+        return jnp.sum(function(*data, bias=bias, softness=softness, **options) ** 2)
+
+    at = (jnp.asarray(shadow_map), jnp.asarray(receivers.z), 0.05, 0.3)
+    exact = ft.partial(shadow.edge_pcf, mask="depth")
+    expected = jax.grad(ft.partial(loss, shadow.pcf), argnums=(0, 1, 2, 3))(*at)
+    found = jax.jit(jax.grad(ft.partial(loss, exact), argnums=(0, 1, 2, 3)))(*at)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_faults_name_their_argument(case):
+    function = inspect.unwrap(shadow.edge_pcf)
+    for name, options in {
+        "size=...": {"size": 4},
+        "mask=...": {"size": 3, "mask": "stencil"},
+        "dilation=...": {"size": 3, "dilation": 0},
+        "kernel=...": {"size": 3, "kernel": "disc"},
+    }.items():
+        with pytest.raises(ValueError) as caught:
+            function(*case, **options)
+        assert str(caught.value).startswith(f"`edge_pcf({name})`")
+    with pytest.raises(ValueError, match=r"`edge_pcf\(dilation=...\)` must be given under"):
+        jax.jit(ft.partial(function, size=3))(*case)
