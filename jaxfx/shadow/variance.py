@@ -44,7 +44,7 @@ def variance(
     **Raises:** `ValueError` for a wrong shape, an integer map, an even size or a negative
     `min_variance`.
 
-    **Gradient:** exact with respect to every float; the farthest depth is constant.
+    **Gradient:** exact with respect to every float, the farthest depth included.
 
     Source: Donnelly & Lauritzen 2006, variance shadow maps, equations 4 and 5.
     """
@@ -89,7 +89,7 @@ def _range(shadow_map, threshold, known):
         own = reduce(jnp.where(finite, shadow_map, start))
         other = reduce(jnp.where(known, threshold, start))
         found = reduce(jnp.stack([own, other]))
-        return jax.lax.stop_gradient(jnp.where(jnp.isfinite(found), found, 0))
+        return jnp.where(jnp.isfinite(found), found, 0)
 
     return over(jnp.min, jnp.inf), over(jnp.max, -jnp.inf)
 
