@@ -1,10 +1,12 @@
 """What every scatter kernel shares: the sprite of a pixel and its exact coverage."""
 
+import functools as ft
 import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxfx._numerics import clip01
@@ -75,6 +77,40 @@ def _row_half_width_jvp(primals, tangents):
     radius, row = primals
     *_, angle = _arc(radius, row)
     return row_half_width(radius, row), radius * angle * tangents[0]
+
+
+@ft.cache
+def _segment_polynomial(degree: int) -> tuple[float, ...]:
+    """P, lowest power first, in `area(s) = pi / 4 - (1 - s)**1.5 P(s)` for s in [0, 1].
+
+    `area` is the integral of `sqrt(1 - s**2)` from 0. P is analytic but for a branch point at
+    -1, so that its Chebyshev series falls by a factor of 5.8 a term.
+    """
+    nodes = (1 - np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree))) / 2
+    area = (nodes * np.sqrt(1 - nodes**2) + np.arcsin(nodes)) / 2
+    values = (np.pi / 4 - area) / (1 - nodes) ** 1.5
+    series = np.polynomial.Chebyshev.fit(nodes, values, degree, domain=(0, 1))
+    return tuple(map(float, series.convert(kind=np.polynomial.Polynomial).coef))
+
+
+def segment_integral(
+    radius: Float[Array, "*shape"], height: Float[Array, ""], slope: bool
+) -> list[Float[Array, "*shape"]]:
+    """The integral of `sqrt(radius**2 - t**2)` from 0 to `height`, and its slope in the radius.
+
+    For the kernels that visit rows in order: a row's half-width is the difference of two, of
+    which one is the next row's, and no arc tangent is left.
+    """
+    s = height / radius
+    s = jnp.where(s < 1, s, 1)
+    polynomial = jnp.zeros_like(s)
+    for coefficient in reversed(_segment_polynomial(9 if s.dtype == jnp.float32 else 18)):
+        polynomial = polynomial * s + coefficient
+    short = 1 - s
+    root = jnp.sqrt(short)
+    area = math.pi / 4 - short * root * polynomial
+    value = radius * radius * area
+    return [value, radius * (2 * area - s * root * jnp.sqrt(1 + s))] if slope else [value]
 
 
 @jax.custom_jvp

@@ -1,7 +1,8 @@
 """Scatter turned round, tile by tile, each tile as far as the sprites that can reach it.
 
-Every tile loops over rows of offsets, out to the largest radius that matters to it; the offsets
-along a row are written out, so that sums stay in registers. A row and its mirror image share
+Every tile loops over rows of offsets, out to the largest radius that matters to it, and along a
+row in runs of 17, out to where that radius ends there. The offsets of a run are written out, so
+that sums stay in registers. A row and its mirror image share
 their half-widths, and the integral at a row's upper edge is the next row's lower one. The
 adjoint is the same sweep with the tiles owned by the sources: no scatter is left in either.
 
@@ -10,30 +11,31 @@ with the square of the radius.
 """
 
 import functools as ft
-import math
 from collections.abc import Callable
 from itertools import count, takewhile
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import sequential_vmap
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxfx._numerics import clip01
+from jaxfx.dof._adjoint import with_adjoint
 from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites
+from jaxfx.dof._sprites import POINT_RADIUS, Sprites, segment_integral
 
 
 # Tall enough to spread a row's overhead, wide for the vector units, small enough for the cache.
 TILE = (64, 128)
-# A row of fewer than 17 taps takes XLA three times as long a tap: it reads every one through a
-# dynamic slice, which it lays out in memory for more readers than 16.
-LEAST_HALO = 8
+# A run of fewer than 17 taps takes XLA three times as long a tap: it reads every one through a
+# dynamic slice, which it lays out in memory for more readers than 16. The middle run is the one
+# of the 8 offsets to either side.
+RUN, NEAR = 17, 8
 
 
-class _Planes(NamedTuple):
+class Planes(NamedTuple):
     """Sprites as the kernel reads them, with `leak` and `coc` in units of epsilon."""
 
     value: Float[Array, "value height width"]
@@ -44,55 +46,20 @@ class _Planes(NamedTuple):
 
 def tiles(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
     """The sums over all sprites that reach at most `reach` pixels along an axis."""
+    return jnp.moveaxis(_sums(reach, to_planes(sprites)), 0, -1)
+
+
+def to_planes(sprites: Sprites) -> Planes:
+    """The sprites as the kernel reads them."""
     value, radius, leak, coc, epsilon = sprites
-    planes = _Planes(_stacked(value), radius, leak / epsilon, coc / epsilon)
-    return jnp.moveaxis(_sums(reach, planes), 0, -1)
-
-
-@ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _sums(reach: int, planes: _Planes) -> Float[Array, "value height width"]:
-    return sequential_vmap(ft.partial(_forward, reach))(planes)
-
-
-@_sums.defjvp
-def _sums_jvp(reach, primals, tangents):
-    (planes,), (tangent,) = primals, tangents
-    push = sequential_vmap(ft.partial(_tangent, reach))
-    pull = sequential_vmap(ft.partial(_adjoint, reach))
-
-    def sums(planes):
-        value, radius, leak, coc = planes
-        one = jnp.ones((), radius.dtype)
-        return _stacked(
-            shift(Sprites(jnp.moveaxis(value, 0, -1), radius, leak, coc, one), reach)
-        )
-
-    # The tangent is linear, S say, and its transpose a kernel of its own. JAX is told so by the
-    # one call that takes both and can be mapped, transposed and differentiated: the solve of
-    # (u, v - S u) = b, which is (u, v + S u), and for the adjoint (u + S^T v, v). The system
-    # itself is wanted by second derivatives only, and may be slow: there S is that of `shift`.
-    def matvec(b):
-        return b[0], b[1] - jax.jvp(sums, (planes,), (b[0],))[1]
-
-    def solve(_, b):
-        return b[0], b[1] + push(planes, b[0])
-
-    def solve_transposed(_, b):
-        return jax.tree.map(jnp.add, b[0], pull(planes, b[1])), b[1]
-
-    # It is transposed in the whole of b: what has no tangent borrows a zero from what has.
-    leaves = jax.tree.leaves(tangent)
-    zero = sum(jnp.where(False, leaf.ravel()[0], 0) for leaf in leaves)
-    b = jax.tree.map(lambda x: x + zero, (tangent, jnp.zeros_like(planes.value)))
-    _, out = jax.lax.custom_linear_solve(matvec, b, solve, solve_transposed)
-    return _sums(reach, planes), out
+    return Planes(_stacked(value), radius, leak / epsilon, coc / epsilon)
 
 
 def _stacked(value: Float[Array, "height width value"]) -> Float[Array, "value height width"]:
     return jnp.moveaxis(value, -1, 0)
 
 
-def _forward(reach: int, planes: _Planes) -> Float[Array, "value height width"]:
+def forward(reach: int, planes: Planes) -> Float[Array, "value height width"]:
     value, radius, leak, coc = planes
 
     def tap(cover, own, other):
@@ -106,7 +73,7 @@ def _forward(reach: int, planes: _Planes) -> Float[Array, "value height width"]:
     return sums
 
 
-def _tangent(reach: int, planes: _Planes, dot: _Planes) -> Float[Array, "value height width"]:
+def tangent(reach: int, planes: Planes, dot: Planes) -> Float[Array, "value height width"]:
     value, radius, leak, coc = planes
 
     def tap(cover, slope, own, other):
@@ -114,20 +81,20 @@ def _tangent(reach: int, planes: _Planes, dot: _Planes) -> Float[Array, "value h
         value, value_dot, leak, leak_dot, radius_dot = other
         rise = leak - coc
         weight = 1 - sharp * _clip(rise)
-        weight_dot = sharp * _inside(rise) * (coc_dot - leak_dot)
+        weight_dot = sharp * inside(rise) * (coc_dot - leak_dot)
         weight_dot = weight_dot + blurring * coc_dot * _clip(rise)
         product_dot = slope * radius_dot * weight + cover * weight_dot
         return [product_dot[None] * value + (cover * weight)[None] * value_dot]
 
-    own = [coc, dot.coc, 1 - clip01(coc - 1), _inside(coc - 1)]
+    own = [coc, dot.coc, 1 - clip01(coc - 1), inside(coc - 1)]
     other = [value, dot.value, leak, dot.leak, dot.radius]
     (sums,) = _sweep(tap, reach, radius, own, other, by_source=False, slopes=True)
     return sums
 
 
-def _adjoint(reach: int, planes: _Planes, bar: Float[Array, "value height width"]) -> _Planes:
+def adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]) -> Planes:
     value, radius, leak, coc = planes
-    sharp, blurring = 1 - clip01(coc - 1), _inside(coc - 1)
+    sharp, blurring = 1 - clip01(coc - 1), inside(coc - 1)
 
     def to_source(cover, slope, own, other):
         value, leak = own
@@ -135,7 +102,7 @@ def _adjoint(reach: int, planes: _Planes, bar: Float[Array, "value height width"
         rise = leak - coc
         weight = 1 - sharp * _clip(rise)
         product = sum(x * y for x, y in zip(value, bar, strict=True))
-        leak_bar = -cover * sharp * _inside(rise) * product
+        leak_bar = -cover * sharp * inside(rise) * product
         return [(cover * weight)[None] * bar, slope * weight * product, leak_bar]
 
     def to_destination(cover, own, other):
@@ -143,7 +110,7 @@ def _adjoint(reach: int, planes: _Planes, bar: Float[Array, "value height width"
         value, leak = other
         rise = leak - coc
         product = sum(x * y for x, y in zip(value, bar, strict=True))
-        return [cover * (sharp * _inside(rise) + blurring * _clip(rise)) * product]
+        return [cover * (sharp * inside(rise) + blurring * _clip(rise)) * product]
 
     own, other = [value, leak], [bar, coc, sharp]
     value_bar, radius_bar, leak_bar = _sweep(
@@ -153,7 +120,16 @@ def _adjoint(reach: int, planes: _Planes, bar: Float[Array, "value height width"
     (coc_bar,) = _sweep(
         to_destination, reach, radius, own, other, by_source=False, slopes=False
     )
-    return _Planes(value_bar, radius_bar, leak_bar, coc_bar)
+    return Planes(value_bar, radius_bar, leak_bar, coc_bar)
+
+
+def plain(reach: int, planes: Planes) -> Float[Array, "value height width"]:
+    value, radius, leak, coc = planes
+    one = jnp.ones((), radius.dtype)
+    return _stacked(shift(Sprites(jnp.moveaxis(value, 0, -1), radius, leak, coc, one), reach))
+
+
+_sums = with_adjoint(forward, tangent, adjoint, plain)
 
 
 def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -162,7 +138,7 @@ def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.where(x < 1, x, 1)
 
 
-def _inside(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def inside(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The derivative of `_clip`, at its kinks the one from above."""
     return ((x >= 0) & (x < 1)).astype(x.dtype)
 
@@ -187,7 +163,8 @@ def _sweep(
     height, width = radius.shape
     tall, wide = min(TILE[0], -(-height // 8) * 8), min(TILE[1], -(-width // 8) * 8)
     rows, columns = -(-height // tall), -(-width // wide)
-    most = max(LEAST_HALO, reach)
+    halos = _halos(reach)
+    most = halos[-1]
     reaches = _tile_reaches(radius, tall, wide, spread=not by_source)
 
     def padded(planes, fill=0.0):
@@ -213,19 +190,21 @@ def _sweep(
 
         def add_row(row, carry):
             sums, lower = carry
-            upper = _integral(sprite, row.astype(sprite.dtype) + 0.5, slopes)
+            upper = segment_integral(sprite, row.astype(sprite.dtype) + 0.5, slopes)
             widths = [x - y for x, y in zip(upper, lower, strict=True)]
+            runs = _runs(reaches[index], row) if halo > NEAR else 0
 
             def add_side(side, sums):
                 shift = ft.partial(_rows, start=halo + (1 - 2 * side) * row, size=tall)
                 there = [*map(shift, theirs)]
                 spans = widths if by_source else [*map(shift, widths)]
-                for column in range(-halo, halo + 1):
-                    at = slice(halo + column, halo + column + wide)
-                    span = spans if by_source else [x[:, at] for x in spans]
-                    taps = tap(*_cover(span, column), mine, [x[..., at] for x in there])
-                    sums = [x + y for x, y in zip(sums, taps, strict=True)]
-                return sums
+                add = ft.partial(_add_run, tap, mine, there, spans, by_source=by_source)
+                near = min(NEAR, halo)
+                sums = add(sums, halo - near, 2 * near + 1, ft.partial(_near_edge, near))
+                if halo <= NEAR:
+                    return sums
+                far = lambda run, sums: add(sums, *_far_run(halo, runs, run, sprite.dtype))
+                return jax.lax.fori_loop(0, 2 * runs, far, sums)
 
             # The middle row is its own mirror image.
             return jax.lax.fori_loop(0, jnp.where(row > 0, 2, 1), add_side, sums), upper
@@ -233,11 +212,9 @@ def _sweep(
         nothing = [jnp.zeros((tall, wide), sprite.dtype)] * (2 if slopes else 1)
         shapes = jax.eval_shape(tap, *nothing, mine, [x[..., :tall, :wide] for x in theirs])
         sums = [jnp.zeros(x.shape, x.dtype) for x in shapes]
-        lower = [-x for x in _integral(sprite, jnp.asarray(0.5, sprite.dtype), slopes)]
+        lower = [-x for x in segment_integral(sprite, jnp.asarray(0.5, sprite.dtype), slopes)]
         return jax.lax.fori_loop(0, reaches[index] + 1, add_row, (sums, lower))[0]
 
-    doubled = takewhile(lambda halo: halo < most, (LEAST_HALO << n for n in count()))
-    halos = [0, *doubled, most]
     branches = [ft.partial(tile, halo) for halo in halos]
 
     def one(index):
@@ -252,8 +229,69 @@ def _sweep(
     return [assembled(x) if x.ndim == 4 else assembled(x)[0] for x in sums]
 
 
+def _add_run(tap, mine, there, spans, sums, start, size, edge, *, by_source):
+    """Add the taps of a run of offsets, the first of which reads its row from `start`.
+
+    `edge` gives how far a span passes into the run's pixel k, and by what factor that grows
+    with its half-width.
+    """
+    wide = mine[0].shape[-1]
+    cut = ft.partial(_columns, start=start, size=wide + size - 1)
+    there = [*map(cut, there)]
+    spans = spans if by_source else [*map(cut, spans)]
+    for k in range(size):
+        at = slice(k, k + wide)
+        width, *width_dot = spans if by_source else [x[:, at] for x in spans]
+        passed, factor = edge(width, k)
+        covers = [_clip(passed), *(inside(passed) * factor * x for x in width_dot)]
+        taps = tap(*covers, mine, [x[..., at] for x in there])
+        sums = [x + y for x, y in zip(sums, taps, strict=True)]
+    return sums
+
+
+def _near_edge(near: int, width: Array, k: int) -> tuple[Array, int]:
+    distance = abs(k - near)
+    return (width + (0.5 - distance), 1) if distance else (2 * width, 2)
+
+
+def _far_run(halo: int, runs: Array, run: Array, dtype: DTypeLike) -> tuple[Any, ...]:
+    """Where one of the runs -n, ..., -1, 1, ..., n begins, its size, its `edge`.
+
+    One to the left begins with its farthest offset.
+    """
+    right = run >= runs
+    first = NEAR + 1 + jnp.where(right, run - runs, runs - 1 - run) * RUN
+    last = first + RUN - 1
+    begin = 0.5 - jnp.where(right, first, last).astype(dtype)
+    toward = jnp.where(right, -1, 1).astype(dtype)
+    edge = lambda width, k: (width + (begin + k * toward), 1)
+    return halo + jnp.where(right, first, -last), RUN, edge
+
+
+def _halos(reach: int) -> list[int]:
+    """How much of a tile's surroundings its programs see: for tiles that nothing reaches, the
+    middle run, and further runs, each about three times as far as the one before.
+    """
+    runs = max(0, -(-(reach - NEAR) // RUN))
+    grown = takewhile(lambda n: 2 * n < runs, (3**n for n in count()))
+    return [0, NEAR, *(NEAR + n * RUN for n in grown)] + [NEAR + runs * RUN] * (runs > 0)
+
+
+def _runs(reach: Int[Array, ""], row: Int[Array, ""]) -> Int[Array, ""]:
+    """How many runs beyond the middle one a disc of that reach covers in a row, to a side."""
+    radius = reach.astype(jnp.float32) + POINT_RADIUS
+    height = jnp.maximum(row.astype(jnp.float32) - 0.5, 0)
+    half_chord = jnp.sqrt(jnp.maximum((radius - height) * (radius + height), 0))
+    columns = jnp.ceil(half_chord - 0.5 + 1e-3).astype(int)
+    return jnp.maximum(0, (columns - NEAR + RUN - 1) // RUN)
+
+
 def _rows(planes: Array, start: Array, size: int) -> Array:
     return jax.lax.dynamic_slice_in_dim(planes, start, size, axis=-2)
+
+
+def _columns(planes: Array, start: Array | int, size: int) -> Array:
+    return jax.lax.dynamic_slice_in_dim(planes, start, size, axis=-1)
 
 
 def _tile_reaches(
@@ -274,42 +312,3 @@ def _tile_reaches(
         there = jnp.broadcast_to(reach, far.shape)
         reach = jnp.where(far <= there, there, 0).max(axis=(2, 3))
     return reach.reshape(-1)
-
-
-def _cover(span: list[Array], column: int) -> list[Float[Array, "*shape"]]:
-    """`_sprites.coverage` for a static column and, given its half-width's, its derivative."""
-    width, *width_dot = span
-    if column == 0:
-        return [_clip(2 * width), *(2 * _inside(2 * width) * x for x in width_dot)]
-    edge = width + (0.5 - abs(column))
-    return [_clip(edge), *(_inside(edge) * x for x in width_dot)]
-
-
-@ft.cache
-def _segment_polynomial(degree: int) -> tuple[float, ...]:
-    """P, lowest power first, in `area(s) = pi / 4 - (1 - s)**1.5 P(s)` for s in [0, 1].
-
-    `area` is the integral of `sqrt(1 - s**2)` from 0. P is analytic but for a branch point at
-    -1, so that its Chebyshev series falls by a factor of 5.8 a term.
-    """
-    nodes = (1 - np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree))) / 2
-    area = (nodes * np.sqrt(1 - nodes**2) + np.arcsin(nodes)) / 2
-    values = (np.pi / 4 - area) / (1 - nodes) ** 1.5
-    series = np.polynomial.Chebyshev.fit(nodes, values, degree, domain=(0, 1))
-    return tuple(map(float, series.convert(kind=np.polynomial.Polynomial).coef))
-
-
-def _integral(
-    radius: Float[Array, "*shape"], height: Float[Array, ""], slope: bool
-) -> list[Float[Array, "*shape"]]:
-    """The integral of `sqrt(radius**2 - t**2)` from 0 to `height`, and its slope."""
-    s = height / radius
-    s = jnp.where(s < 1, s, 1)
-    polynomial = jnp.zeros_like(s)
-    for coefficient in reversed(_segment_polynomial(9 if s.dtype == jnp.float32 else 18)):
-        polynomial = polynomial * s + coefficient
-    short = 1 - s
-    root = jnp.sqrt(short)
-    area = math.pi / 4 - short * root * polynomial
-    value = radius * radius * area
-    return [value, radius * (2 * area - s * root * jnp.sqrt(1 + s))] if slope else [value]

@@ -2,7 +2,7 @@
 
 import functools as ft
 import math
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,21 @@ from jaxfx._numerics import (
 )
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof._shift import shift
+from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.dof._tiles import tiles
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
-Kernel = Literal["auto", "segment_sum", "shift", "tiles"]
+Kernel = Literal["auto", "segment_sum", "shift", "tiles", "spans"]
 Coverage = Literal["area", "indicator"]
 
-# Where "shift" adds fewer taps than this it takes some 15 ms, and compiles sooner than "tiles".
-_FEW_TAPS = 2**23
+# For `cheapest`: seconds, and three times nanoseconds a pixel.
+_SECONDS: dict[Any, tuple[float, float, float, float]] = {
+    "shift": (0.0, 5.0, 0.0, 1.5),
+    "tiles": (0.01, 20.0, 0.0, 0.5),
+    "spans": (0.02, 80.0, 6.0, 0.0),
+}
 
 # Visibility stays below e**60, so that its sums with highlights are finite in float32.
 _LOG_VISIBILITY = 60.0
@@ -69,8 +74,10 @@ def scatter(
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
     - `kernel`: which program computes the sums, all the same: `"segment_sum"` writes every tap
       out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an
-      offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it.
-      `"auto"` is `"tiles"`, or `"shift"` where the work is so little that compiling counts.
+      offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
+      `"spans"` paints large sprites row by row with running sums, at a cost that grows with the
+      radius, not its square. `"auto"` is the cheapest of the last three by a model of their
+      time: outside of transforms for the largest circle in the data, else for `max_coc`.
     - `coverage`: `"area"`, the exact area of the disc in each row of pixels, or `"indicator"`,
       the paper's own, 1 where a pixel's centre lies inside (`"segment_sum"` only).
 
@@ -88,7 +95,9 @@ def scatter(
     Source: Lee, Kim & Choi, real-time depth of field rendering using pixel intensity scatter on
     GPU, sections 3 and 4; the model is that of Potmesil & Chakravarty 1981. Our own: the exact
     row area as coverage, whose sum over pixels is the disc's area at any radius, so that energy
-    is conserved, a pixel in focus is untouched, and the derivative in the radius exists.
+    is conserved, a pixel in focus is untouched, and the derivative in the radius exists; and
+    the split by which `"spans"` carry the leak rejection exactly (a source of 3 epsilon or more
+    has the same factor `clamp(C_q / epsilon - 1)` from every pixel behind the focus).
     """
     image = check_image("scatter(image)", image)
     depth = check_depth("scatter(depth)", depth, image.shape[:2])
@@ -112,6 +121,13 @@ def scatter(
     max_coc = largest_coc("scatter", depth, lens) if max_coc is None else max_coc
     if not (isinstance(max_coc, int | float) and 0 < max_coc < math.inf):
         raise ValueError(f"`scatter(max_coc=...)` must be positive, got {max_coc}.")
+    if kernel == "auto":
+        # From the data where they can be looked at, else from what they may hold; the kernels
+        # themselves go no farther, tile by tile, than what they do hold.
+        room = max_coc
+        if is_concrete(depth, lens):
+            room = min(room, _largest(depth, lens))
+        kernel = cheapest(*depth.shape, room)
     return _scatter(image, depth, lens, gamma, epsilon, float(max_coc), kernel, coverage)
 
 
@@ -127,7 +143,7 @@ def largest_coc(
             f"`{function}(max_coc=...)` must be given under `jit`, `grad` and `vmap`, where it "
             "can't be taken from the data: a static diameter in pixels, got None."
         )
-    largest = float(jnp.max(lens.circle_of_confusion(depth)))
+    largest = _largest(depth, lens)
     if not math.isfinite(largest):
         raise ValueError(
             f"`{function}(max_coc=...)` must be given where a circle of confusion is not "
@@ -135,6 +151,17 @@ def largest_coc(
         )
     step = 2 ** max(0, math.floor(math.log2(max(largest, 1))) - 2) / 2
     return max(1.0, math.ceil(largest / step) * step)
+
+
+def _largest(depth: Float[Array, "height width"], lens: ThinLens | FocusPlanes) -> float:
+    """The largest circle of concrete data that is a number, inside of another trace as well."""
+    with jax.ensure_compile_time_eval():
+        return float(jnp.nanmax(lens.circle_of_confusion(depth)))
+
+
+def _radius(coc: Float[Array, "height width"], max_coc: int | float) -> Array:
+    coc = jnp.where(coc < max_coc, coc, max_coc)
+    return jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
 
 
 def to_sprites(
@@ -149,11 +176,12 @@ def to_sprites(
     dtype = image.dtype
     coc = lens.circle_of_confusion(depth)
     coc = jnp.where(coc < max_coc, coc, max_coc)
-    radius = jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
+    radius = _radius(coc, max_coc)
 
     focus = lens.focus_distance.astype(dtype)
     foreground = depth < focus
     nearness = jnp.where(foreground, focus / jnp.where(foreground, depth, focus), 1)
+    nearness = jnp.minimum(nearness, jnp.finfo(dtype).max)  # at depth 0 under a transform
     log_visibility = gamma.astype(dtype) * jnp.log(nearness)
     visibility = jnp.exp(jnp.minimum(log_visibility, _LOG_VISIBILITY))
 
@@ -180,6 +208,65 @@ def _spoiled(
     return jax.lax.cond(wrong.any(), cover, lambda: wrong)
 
 
+@ft.partial(jax.custom_jvp, nondiff_argnums=(5, 6, 7))
+def _in_or_out_of_focus(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
+    """A picture wholly in focus is itself; its derivative is computed like any other."""
+    sharp = (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
+    blurred = ft.partial(_blurred, max_coc=max_coc, kernel=kernel, coverage=coverage)
+    operands = image, depth, lens, gamma, epsilon
+    return jax.lax.cond(sharp, lambda image, *_: image, blurred, *operands)
+
+
+@_in_or_out_of_focus.defjvp
+def _in_or_out_of_focus_jvp(max_coc, kernel, coverage, primals, tangents):
+    blurred = ft.partial(_blurred, max_coc=max_coc, kernel=kernel, coverage=coverage)
+    return jax.jvp(blurred, primals, tangents)
+
+
+def _blurred(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
+    """The quotient of the two sums, for finite pixels."""
+    # Rematerialised: a reverse pass keeps the sprites, not the twenty planes they are made of.
+    made = jax.checkpoint(to_sprites, static_argnums=5)
+    sprites = made(image, depth, lens, gamma, epsilon, max_coc)
+    if kernel == "segment_sum":
+        sums = segment_sum(sprites, reach(max_coc), coverage)
+    else:
+        kernels = {"shift": shift, "tiles": tiles, "spans": spans}
+        sums = kernels[kernel](sprites, reach(max_coc))
+    return _quotient(sums)
+
+
+@jax.custom_jvp
+def _quotient(
+    sums: Float[Array, "height width value"],
+) -> Float[Array, "height width channel"]:
+    """The channels over the weight. As the rule states it, a weight is never squared."""
+    return sums[..., :-1] / sums[..., -1:]
+
+
+@_quotient.defjvp
+def _quotient_jvp(primals, tangents):
+    (sums,), (dot,) = primals, tangents
+    result = _quotient(sums)
+    return result, (dot[..., :-1] - result * dot[..., -1:]) / sums[..., -1:]
+
+
+def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
+    """The kernel that takes least for a picture whose every sprite is the largest.
+
+    Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows**2)`, with
+    `2 * reach + 1` rows; the constants were measured on two cores. What is fixed stands for the
+    time that a kernel takes to compile, shared by a few dozen pictures.
+    """
+    pixels, rows = height * width, 2 * reach(max_coc) + 1
+
+    def seconds(kernel: str) -> float:
+        fixed, once, row, tap = _SECONDS[kernel]
+        return fixed + 1e-9 * pixels * (once + row * rows + tap * rows**2)
+
+    return min(_SECONDS, key=seconds)
+
+
 @ft.partial(jax.jit, static_argnames=("max_coc", "kernel", "coverage"))
 def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     dtype = image.dtype
@@ -192,18 +279,8 @@ def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     image = jnp.where(wrong[..., None], 0, image)
     depth = jnp.where(lost, lens.focus_distance.astype(image.dtype), depth)
 
-    sprites = to_sprites(image, depth, lens, gamma, epsilon, max_coc)
-    far = reach(max_coc)
-    if kernel == "auto":
-        kernel = "shift" if depth.size * (2 * far + 1) ** 2 < _FEW_TAPS else "tiles"
-    if kernel == "segment_sum":
-        sums = segment_sum(sprites, far, coverage)
-    else:
-        sums = {"shift": shift, "tiles": tiles}[kernel](sprites, far)
-    # Both are scaled to a weight of 1 first: the derivative of a quotient squares it.
-    sums = sums / jax.lax.stop_gradient(sums[..., -1:])
-    result = sums[..., :-1] / sums[..., -1:]
-
-    radius = jnp.where(lost, max_coc / 2, jax.lax.stop_gradient(sprites.radius))
+    result = _in_or_out_of_focus(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage)
+    radius = jax.lax.stop_gradient(_radius(coc, max_coc))
+    radius = jnp.where(lost, max_coc / 2, radius)
     spoiled = _spoiled(wrong, radius, max_coc)
     return jnp.where(spoiled[..., None], jnp.nan, result).astype(dtype)

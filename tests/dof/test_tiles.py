@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import Sprites, row_half_width
-from jaxfx.dof._tiles import TILE, _integral, _tile_reaches, tiles
+from jaxfx.dof._sprites import Sprites, row_half_width, segment_integral
+from jaxfx.dof._tiles import TILE, _tile_reaches, tiles
 
 
 REACH = 18
@@ -79,7 +79,8 @@ def test_the_polynomial_is_the_arc(dtype):
     tolerance = 1e-6 if dtype == jnp.float32 else 1e-11
     for row in range(5):
         upper, lower = (
-            _integral(radius, jnp.asarray(abs(row + edge), dtype), True) for edge in (0.5, -0.5)
+            segment_integral(radius, jnp.asarray(abs(row + edge), dtype), True)
+            for edge in (0.5, -0.5)
         )
         sign = -1 if row == 0 else 1  # odd in the height
         width, slope = (x - sign * y for x, y in zip(upper, lower, strict=True))
