@@ -192,7 +192,7 @@ def _sweep(
             sums, lower = carry
             upper = segment_integral(sprite, row.astype(sprite.dtype) + 0.5, slopes)
             widths = [x - y for x, y in zip(upper, lower, strict=True)]
-            runs = _runs(reaches[index], row) if halo > NEAR else 0
+            runs = _runs(reaches[index], row)
 
             def add_side(side, sums):
                 shift = ft.partial(_rows, start=halo + (1 - 2 * side) * row, size=tall)

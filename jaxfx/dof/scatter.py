@@ -127,7 +127,8 @@ def scatter(
         room = max_coc
         if is_concrete(depth, lens):
             room = min(room, _largest(depth, lens))
-        kernel = cheapest(*depth.shape, room)
+        height, width = depth.shape
+        kernel = cheapest(height, width, room)
     return _scatter(image, depth, lens, gamma, epsilon, float(max_coc), kernel, coverage)
 
 

@@ -14,7 +14,7 @@ import pytest
 from jaxfx import FocusPlanes, ThinLens, dof
 
 
-KERNELS = ("segment_sum", "shift", "tiles")
+KERNELS = ("segment_sum", "shift", "tiles", "spans")
 
 
 def row_area(radius, row):

@@ -1,0 +1,149 @@
+"""The spans where they differ from the others: large radii, several blocks, highlights."""
+
+import functools as ft
+import importlib
+
+import hypothesis as hyp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jaxfx import ThinLens, dof
+from jaxfx.dof._paint import BLOCK
+from jaxfx.dof._shift import shift
+from jaxfx.dof._spans import spans
+from jaxfx.dof._sprites import Sprites
+from jaxfx.dof._tiles import tiles
+
+
+REACH = 21
+SHAPE = (BLOCK[0] + 7, BLOCK[1] + 9)
+KERNELS = {"shift": shift, "tiles": tiles, "spans": spans}
+
+
+def sprites(seed=0, shape=SHAPE, largest=2 * REACH, epsilon=1.7, dtype=np.float64):
+    """Every share of large and small, before and behind the focus, over several blocks."""
+    rng = np.random.default_rng(seed)
+    coc = rng.uniform(0, largest, shape) ** rng.choice([0, 0.5, 1], shape)
+    leak = np.where(rng.random(shape) < 0.3, -1.0, coc)
+    radius = np.maximum(coc / 2, 0.5)
+    value = rng.uniform(0.5, 1.0, (*shape, 3)) / (np.pi * radius * radius)[..., None]
+    planes = (jnp.asarray(x, dtype) for x in (value, radius, leak, coc, epsilon))
+    return Sprites(*planes)
+
+
+@ft.cache
+def sums_and_gradient(kernel):
+    def loss(sprites):
+        sums = KERNELS[kernel](sprites, REACH)
+        weight = jnp.sin(jnp.arange(sums.size, dtype=sums.dtype) ** 2).reshape(sums.shape)
+        return jnp.sum(weight * sums), sums
+
+    return jax.jit(jax.value_and_grad(loss, has_aux=True))(sprites())
+
+
+def test_many_blocks_have_the_same_sums():
+    (_, expected), _ = sums_and_gradient("shift")
+    (_, result), _ = sums_and_gradient("spans")
+    np.testing.assert_allclose(result, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("field", Sprites._fields)
+def test_many_blocks_have_the_same_gradient(field):
+    _, expected = sums_and_gradient("shift")
+    _, result = sums_and_gradient("spans")
+    assert np.abs(getattr(expected, field)).max() > 1e-4
+    np.testing.assert_allclose(getattr(result, field), getattr(expected, field), atol=1e-8)
+
+
+@ft.cache
+def compiled(kernel):
+    return jax.jit(lambda sprites: KERNELS[kernel](sprites, 64))
+
+
+@hyp.given(st.integers(0, 2**32 - 1), st.floats(0.01, 12), st.floats(2, 128))
+@hyp.settings(max_examples=10, deadline=None)
+def test_kernels_agree_to_a_radius_of_64(seed, epsilon, largest):
+    for dtype, tolerance in ((np.float64, 1e-10), (np.float32, 1e-4)):
+        given = sprites(seed, (33, 41), largest, epsilon, dtype)
+        expected = compiled("shift")(given)
+        scale = np.asarray(expected[..., -1:])
+        for kernel in ("tiles", "spans"):
+            difference = (compiled(kernel)(given) - expected) / scale
+            assert np.abs(difference).max() < tolerance, kernel
+
+
+@pytest.mark.parametrize("bright", [1e2, 1e4, 1e6])
+@pytest.mark.parametrize("share", [1, 40])
+def test_highlights_leave_dim_pixels_alone(bright, share):
+    rng = np.random.default_rng(3)
+    given = sprites(4, (33, 41), 40.0, 1.0)
+    lit = np.zeros(given.radius.shape, bool)
+    lit.ravel()[rng.choice(lit.size, share, replace=False)] = True
+    # All go to the left of a gap that no highlight reaches, along the same rows.
+    lit &= (np.arange(41) + np.ceil(given.radius) < 30) & (np.asarray(given.radius) > 1.5)
+    value = jnp.where(lit[..., None], bright, 1.0) * given.value
+    exact = compiled("shift")(given._replace(value=value))
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), given._replace(value=value))
+    result = compiled("spans")(single)[:, 31:]
+    np.testing.assert_allclose(result, exact[:, 31:], rtol=1e-3)
+
+
+def test_the_leak_rejection_splits_at_three_epsilon():
+    rng = np.random.default_rng(5)
+    epsilon = rng.uniform(0.1, 4, 10_000)
+    p, q = rng.uniform(3, 40, 10_000) * epsilon, rng.uniform(0, 40, 10_000) * epsilon
+    sharp = 1 - np.clip(q / epsilon - 1, 0, 1)
+    whole = 1 - sharp * np.clip((p - q) / epsilon, 0, 1)
+    np.testing.assert_array_equal(whole, 1 - sharp)
+
+
+def test_the_cost_model_knows_who_is_quickest_where():
+    module = importlib.import_module("jaxfx.dof.scatter")
+    assert module.cheapest(64, 64, 8) == "shift"
+    assert module.cheapest(512, 512, 8) == module.cheapest(512, 512, 16) == "tiles"
+    assert module.cheapest(512, 512, 24) == module.cheapest(1024, 1024, 64) == "spans"
+
+
+def test_auto_looks_at_the_data_where_it_can(monkeypatch):
+    module = importlib.import_module("jaxfx.dof.scatter")
+    asked = []
+    monkeypatch.setattr(
+        module, "cheapest", lambda *size: asked.append(size) or "shift", raising=True
+    )
+    image, depth, lens = jnp.ones((5, 6, 1)), jnp.full((5, 6), 4.0), ThinLens(0.1, 2.0, 80.0)
+    blur = lambda depth: dof.scatter(image, depth, lens, max_coc=9)
+    blur(depth)
+    jax.jit(blur)(depth)
+    jax.jit(lambda gamma: dof.scatter(image, depth, lens, max_coc=9, gamma=gamma))(1.0)
+    jax.jit(lambda i: dof.scatter(i, depth, lens))(image)
+    largest = float(lens.circle_of_confusion(depth)[0, 0])
+    assert asked == [(5, 6, largest), (5, 6, 9), (5, 6, largest), (5, 6, largest)]
+
+
+@pytest.mark.parametrize("kernel", ["segment_sum", "shift", "tiles", "spans"])
+def test_solvers_run_on_every_kernel(kernel):
+    rng = np.random.default_rng(6)
+    image = jnp.asarray(rng.random((12, 11, 1)))
+    depth = jnp.asarray(rng.uniform(1.2, 6, (12, 11)))
+
+    def residual(aperture, reference):
+        lens = ThinLens(aperture, 2.5, 60.0)
+        blurred = dof.scatter(image, depth, lens, epsilon=0.7, max_coc=8, kernel=kernel)
+        return blurred - reference
+
+    reference = residual(jnp.asarray(0.12), 0.0)
+    start, tolerance = jnp.asarray(0.1), {"rtol": 1e-6, "atol": 1e-8}
+    solver = optx.LevenbergMarquardt(**tolerance)
+    found = optx.least_squares(residual, solver, start, args=reference, throw=False)
+    assert found.value == pytest.approx(0.12, rel=1e-4)
+    loss = lambda aperture, reference: jnp.sum(residual(aperture, reference) ** 2)
+    found = optx.minimise(loss, optx.BFGS(**tolerance), start, args=reference, throw=False)
+    assert found.value == pytest.approx(0.12, rel=1e-4)
+
+    _, push = jax.linearize(lambda aperture: residual(aperture, 0.0), start)
+    steps = [residual(start + h, 0.0) for h in (1e-6, -1e-6)]
+    np.testing.assert_allclose(push(1.0), (steps[0] - steps[1]) / 2e-6, rtol=1e-6, atol=1e-6)
