@@ -40,8 +40,9 @@ def test_depth_mask_is_pcf_to_the_last_bit(size, dtype):
             np.testing.assert_array_equal(visible, shadow.pcf(*case, **options))
 
 
-@pytest.mark.parametrize("kernel", ["box", "tent", "gaussian"])
-@pytest.mark.parametrize("softness", [None, 0.2])
+@pytest.mark.parametrize(
+    ("kernel", "softness"), [("box", 0.2), ("tent", None), ("gaussian", 0.2)]
+)
 def test_depth_mask_is_pcf_in_every_form(kernel, softness):
     case = steps_case(3)
     options = {"size": 5, "kernel": kernel, "softness": softness, "bias": 0.02}
@@ -63,14 +64,15 @@ def test_depth_mask_is_where_the_comparisons_differ(size):
 def test_comparisons_are_counted_where_they_are_made():
     """The loop visits every candidate once, and nothing else; none for a map without edges."""
     rng = np.random.default_rng(0)
+
+    @jax.jit
+    def visit(where):
+        number = lambda pixels: 1.0 + pixels.astype(float)
+        return _compact.replace(where, jnp.zeros(9001), lambda pixels: pixels, number)
+
     for share in (0.0, 0.001, 0.04, 0.5, 1.0):
         where = jnp.asarray(rng.uniform(size=9001) < share)
-        visits = _compact.replace(
-            where,
-            jnp.zeros(9001),
-            lambda pixels: pixels,
-            lambda pixels: 1.0 + pixels.astype(float),
-        )
+        visits = visit(where)
         np.testing.assert_array_equal(visits, jnp.where(where, jnp.arange(1.0, 9002.0), 0))
     ends = jnp.cumsum(jnp.asarray(rng.integers(0, 5, 77), jnp.int32)).astype(jnp.int32)
     ranks = jnp.arange(int(ends[-1]), dtype=jnp.int32)
@@ -96,11 +98,13 @@ def test_chunks_run_as_many_as_there_are_candidates():
         assert len(calls) == steps
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (6, 3), (20, 23)])
-@pytest.mark.parametrize("size", [1, 3, 7, 21])
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [((1, 1), 3), ((1, 9), 7), ((6, 3), 21), ((20, 23), 1), ((20, 23), 3), ((20, 23), 21)],
+)
 def test_running_extremes(shape, size):
     image = np.random.default_rng(0).normal(size=shape)
-    smallest, largest = extremes(jnp.asarray(image), size)
+    smallest, largest = map(np.asarray, jax.jit(extremes, static_argnums=1)(image, size))
     half = size // 2
     for j, i in np.ndindex(*shape):
         window = image[max(j - half, 0) : j + half + 1, max(i - half, 0) : i + half + 1]
@@ -120,7 +124,7 @@ def plate_case(magnification, width, side=96, texels=64):
     return shadow_map, shadow.Receivers(*map(jnp.asarray, (u, v, np.full_like(u, 4.0), 0 * u)))
 
 
-@pytest.mark.parametrize("magnification", [0.25, 0.5, 1.0, 2.0, 8.0])
+@pytest.mark.parametrize("magnification", [0.25, 1.0, 8.0])
 def test_screen_mask_with_enough_dilation_loses_no_wide_shadow(magnification):
     case = plate_case(magnification, 16 if magnification < 8 else 6)
     screen = shadow.edge_pcf(*case, size=7, mask="screen")
@@ -131,7 +135,7 @@ def test_screen_mask_misses_less_the_farther_edges_reach():
     case = plate_case(4.0, 4)
     full = shadow.pcf(*case, size=7)
     differing = [
-        int(jnp.sum(shadow.edge_pcf(*case, size=7, dilation=d) != full)) for d in (1, 4, 8, 16)
+        int(jnp.sum(shadow.edge_pcf(*case, size=7, dilation=d) != full)) for d in (1, 8, 16)
     ]
     assert differing == sorted(differing, reverse=True)
     assert differing[0] > 96
@@ -166,10 +170,9 @@ def test_nothing_to_filter_is_nothing_done(case):
         assert (shadow.edge_pcf(lit, case[1], size=7, mask=mask) == 1).all()
 
 
-@pytest.mark.parametrize("kernel", ["box", "tent"])
-def test_derivatives_are_pcfs(kernel):
+def test_derivatives_are_pcfs():
     shadow_map, receivers = random_case()
-    options = {"size": 3, "kernel": kernel}
+    options = {"size": 3, "kernel": "tent"}
 
     def loss(function, shadow_map, z, bias, softness):
         data = (shadow_map, receivers._replace(z=z))
@@ -177,8 +180,10 @@ def test_derivatives_are_pcfs(kernel):
 
     at = (jnp.asarray(shadow_map), jnp.asarray(receivers.z), 0.05, 0.3)
     exact = ft.partial(shadow.edge_pcf, mask="depth")
-    expected = jax.grad(ft.partial(loss, shadow.pcf), argnums=(0, 1, 2, 3))(*at)
-    found = jax.jit(jax.grad(ft.partial(loss, exact), argnums=(0, 1, 2, 3)))(*at)
+    found, expected = (
+        jax.jit(jax.grad(ft.partial(loss, function), argnums=(0, 1, 2, 3)))(*at)
+        for function in (exact, shadow.pcf)
+    )
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
 

@@ -134,7 +134,7 @@ def test_points_beside_and_behind_the_light_have_finite_gradients():
     found = shadow.receivers(depth, camera, light)
     np.testing.assert_array_equal(found.z[2:], -1)
     assert (np.asarray(found.z[:2]) > 0).all()
-    for leaf in jax.tree.leaves(jax.grad(loss, argnums=(0, 1))(depth, light)):
+    for leaf in jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1)))(depth, light)):
         assert np.isfinite(leaf).all()
 
 

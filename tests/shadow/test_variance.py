@@ -58,7 +58,7 @@ def test_reverse_mode_matches_differences(case):
         return jnp.sum(shadow.variance(*data, size=3, bias=bias) ** 2)
 
     arguments = (receivers.u, jnp.asarray(0.1))
-    slopes = jax.grad(loss, argnums=(0, 1))(*arguments)
+    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(*arguments)
     step = 1e-6
     ahead, behind = (loss(*(x + s for x in arguments)) for s in (step, -step))
     expected = float(ahead - behind) / (2 * step)
