@@ -92,6 +92,31 @@ def test_highlights_leave_dim_pixels_alone(bright, share):
     np.testing.assert_allclose(result, exact[:, 31:], rtol=1e-3)
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_order_of_pixels_is_irrelevant(kernel):
+    # The picture of all is the sum of the pictures of any parts, taken in any order.
+    given = sprites(7, (33, 41), 30.0)
+    part = np.random.default_rng(8).integers(0, 3, given.radius.shape)
+    only = lambda k: given._replace(value=jnp.where((part == k)[..., None], given.value, 0))
+    parts = [compiled(kernel)(only(k)) for k in (2, 0, 1)]
+    np.testing.assert_allclose(sum(parts), compiled(kernel)(given), atol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_memory_of_a_gradient_does_not_grow_with_taps(kernel):
+    given = sprites(0, (120, 130))
+
+    def size(reach):
+        loss = lambda given: jnp.sum(KERNELS[kernel](given, reach) ** 2)
+        options = {"xla_backend_optimization_level": 0}
+        compiled = jax.jit(jax.grad(loss), compiler_options=options).lower(given).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    # Sixteen times the taps; what grows is the margin about the picture.
+    margins = (120 + 96) * (130 + 96) / ((120 + 24) * (130 + 24))
+    assert size(48) < 1.5 * margins * size(12)
+
+
 def test_the_leak_rejection_splits_at_three_epsilon():
     rng = np.random.default_rng(5)
     epsilon = rng.uniform(0.1, 4, 10_000)
