@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import sequential_vmap
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -212,10 +213,16 @@ def _spoiled(
 @ft.partial(jax.custom_jvp, nondiff_argnums=(5, 6, 7))
 def _in_or_out_of_focus(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     """A picture wholly in focus is itself; its derivative is computed like any other."""
-    sharp = (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
     blurred = ft.partial(_blurred, max_coc=max_coc, kernel=kernel, coverage=coverage)
-    operands = image, depth, lens, gamma, epsilon
-    return jax.lax.cond(sharp, lambda image, *_: image, blurred, *operands)
+
+    # A batch is worked through one by one: each of its pictures may be sharp or not.
+    @sequential_vmap
+    def picture(image, depth, lens, gamma, epsilon):
+        sharp = (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
+        operands = image, depth, lens, gamma, epsilon
+        return jax.lax.cond(sharp, lambda image, *_: image, blurred, *operands)
+
+    return picture(image, depth, lens, gamma, epsilon)
 
 
 @_in_or_out_of_focus.defjvp
