@@ -201,13 +201,18 @@ def _spoiled(
 ) -> Bool[Array, "height width"]:
     """Where the sprites of the `wrong` pixels reach; nothing is computed if there are none."""
 
-    def cover() -> Bool[Array, "height width"]:
+    def cover(wrong, radius):
         value = wrong[..., None].astype(radius.dtype)
         zero = jnp.zeros_like(radius)
         one = jnp.ones((), radius.dtype)
         return shift(Sprites(value, radius, zero - 1, zero, one), reach(max_coc))[..., 0] > 0
 
-    return jax.lax.cond(wrong.any(), cover, lambda: wrong)
+    # One by one, since under `vmap` a `cond` of its own would compute both.
+    @sequential_vmap
+    def spoiled(wrong, radius):
+        return jax.lax.cond(wrong.any(), cover, lambda wrong, _: wrong, wrong, radius)
+
+    return spoiled(wrong, radius)
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(5, 6, 7))
