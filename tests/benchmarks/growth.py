@@ -66,7 +66,9 @@ def draw(rows, path):
     figure, axes = plt.subplots(1, 2, figsize=(9.5, 4.2), sharey=True, layout="constrained")
     for method in METHODS:
         for ax, fixed, at, along in ((axes[0], 0, 512, 1), (axes[1], 1, 8, 0)):
+            # Both sweeps pass through one point: the first of the two is drawn.
             line = [row for row in rows if row[2] == method and row[fixed] == at]
+            line = sorted({row[along]: row for row in reversed(line)}.values())
             style = {"color": "0.3", "linestyle": "--"} if method == "native" else {}
             ax.errorbar(
                 [row[along] for row in line],
@@ -78,11 +80,14 @@ def draw(rows, path):
                 **style,
             )
     switch = next(r / 2 for r in range(1, 128) if cheapest(512, 512, float(r)) == "spans")
-    axes[0].axvline(switch, color="0.7", zorder=0)
-    axes[0].text(switch * 1.05, 0.6, '"auto":\n tiles | spans', color="0.4", ha="center")
     small = next(n for n in range(1, 4096) if cheapest(n, n, 16.0) != "shift")
-    axes[1].axvline(small, color="0.7", zorder=0)
-    axes[1].text(small, 0.6, '"auto":\n shift | tiles', color="0.4", ha="center")
+    for ax, at, names in (
+        (axes[0], switch, "tiles | spans"),
+        (axes[1], small, "shift | tiles"),
+    ):
+        ax.axvline(at, color="0.7", zorder=0)
+        low = {"transform": ax.get_xaxis_transform(), "ha": "center", "backgroundcolor": "w"}
+        ax.text(at, 0.03, f'"auto": {names}', color="0.4", fontsize=8, **low)
     axes[0].set(
         xlabel="largest radius (pixels), 512 x 512", ylabel="time (ms, median of 3 to 9)"
     )
