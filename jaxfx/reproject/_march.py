@@ -99,7 +99,10 @@ def _interval(depth: Array, r: Rays, begin: Entry) -> tuple[Array, Array]:
     leave_x = _grid.crossing((1 - left) * width, r.ox, r.ix, left).time
     leave_y = _grid.crossing((1 - up) * height, r.oy, r.iy, up).time
     farthest = jnp.max(jnp.where(depth < jnp.inf, depth, -jnp.inf))
-    behind = jnp.where((r.dz > 0) & (farthest > -jnp.inf), (farthest - r.oz) * r.iz, jnp.inf)
+    # With room for rounding: the last step is to be behind the farthest texel as well.
+    slack = 8 * jnp.finfo(depth.dtype).eps * (jnp.abs(farthest) + jnp.abs(r.oz))
+    behind = (farthest + slack - r.oz) * r.iz
+    behind = jnp.where((r.dz > 0) & (farthest > -jnp.inf), behind, jnp.inf)
     end = jnp.minimum(jnp.minimum(leave_x, leave_y), behind)
     start = jnp.where(begin.inside, start, 0)
     return start, jnp.where(end < jnp.inf, jnp.maximum(end, start), start)

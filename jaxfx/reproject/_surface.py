@@ -28,19 +28,28 @@ class Point(NamedTuple):
 
 def texel_point(depth: Array, origin: Array, direction: Array, found: Found) -> Point:
     """The hit on the top or on a side of a texel."""
-    time, hold = found.time, jax.lax.stop_gradient
-    x, y, z = jnp.moveaxis(origin + time[:, None] * direction, -1, 0)
-    dx, dy, dz = jnp.moveaxis(hold(direction), -1, 0)
+    miss, slope = _texel_miss(depth, origin, direction, found)
+    grazing = (slope == 0) & found.mask
+    known = found.mask & ~grazing
+    return _differentiable(origin, direction, found.time, miss, slope, known, grazing)
+
+
+def _texel_miss(
+    depth: Array, origin: Array, direction: Array, found: Found
+) -> tuple[Float[Array, " ray"], Float[Array, " ray"]]:
+    """What is 0 at the hit of a top or a side, and how fast it grows along the ray."""
+    x, y, z = jnp.moveaxis(origin + found.time[:, None] * direction, -1, 0)
+    dx, dy, dz = jnp.moveaxis(jax.lax.stop_gradient(direction), -1, 0)
     top = jnp.where(found.mask, depth[found.y, found.x], 0)
-    # What is 0 at the hit, and how fast it grows along the ray.
     held = [jnp.zeros_like(x)] * 4
     miss, slope = list(held), [jnp.ones_like(x)] * 4
     miss[TOP], slope[TOP] = z - jnp.where(jnp.isfinite(top), top, 0), dz
     miss[X_SIDE], slope[X_SIDE] = x, dx
     miss[Y_SIDE], slope[Y_SIDE] = y, dy
-    miss, slope = (jnp.choose(found.side, v, mode="clip") for v in (miss, slope))
-    grazing = (slope == 0) & found.mask
-    return _differentiable(origin, direction, time, miss, slope, found.mask & ~grazing, grazing)
+    return (
+        jnp.choose(found.side, miss, mode="clip"),
+        jnp.choose(found.side, slope, mode="clip"),
+    )
 
 
 def bilinear_point(
@@ -48,7 +57,8 @@ def bilinear_point(
 ) -> Point:
     """The hit on the patch through the texels' centres, near the one that was found.
 
-    Where the ray does not meet the patch within a texel or so, the texel's own hit stays.
+    Where the ray does not meet the patch within a texel or so, the texel's own hit stays, and
+    its derivative.
     """
     hold = jax.lax.stop_gradient
     depth_held, o, d = hold(depth), hold(origin), hold(direction)
@@ -79,9 +89,11 @@ def bilinear_point(
     steep = slope > _GRAZING * terms
     arrived = steep & (last * per_texel < _ARRIVED) & found.mask
     time = jnp.where(arrived, time, found.time)
-    miss = gap(depth, origin, direction, time)
-    grazing = found.mask & ~arrived
-    return _differentiable(origin, direction, time, miss, slope, arrived, grazing)
+    texel_miss, texel_slope = _texel_miss(depth, origin, direction, found)
+    miss = jnp.where(arrived, gap(depth, origin, direction, time), texel_miss)
+    slope = jnp.where(arrived, slope, texel_slope)
+    known, grazing = found.mask & (slope != 0), found.mask & ~arrived
+    return _differentiable(origin, direction, time, miss, slope, known, grazing)
 
 
 def _differentiable(origin, direction, time, miss, slope, known, grazing) -> Point:

@@ -23,8 +23,9 @@ class Hit(NamedTuple):
     - `mask`: ..., whether it hits.
     - `steps`: ..., an integer, the texels of any level that were looked at.
     - `exhausted`: ..., whether `max_steps` ended the search; such a ray counts as a miss.
-    - `grazing`: ..., whether the ray meets the surface too slantingly for a derivative: its
-      position is the texel's own, and a derivative of its time is taken as 0.
+    - `grazing`: ..., whether the ray runs along the texel's top, where a derivative of its time
+      is taken as 0, or misses the patch or meets it too slantingly, where the position and its
+      derivative are the texel's own.
     """
 
     position: Float[Array, "*ray 3"]
@@ -76,7 +77,7 @@ def intersect(
     **Gradient:** exact for the point where a ray meets the column or the patch that it hits,
     with respect to `depth`, `origin` and `direction`; second derivatives are not. Missing:
     which texel is hit, what comes into sight or goes out of it. Zero for a miss but for its
-    origin's own, and for the time of a `grazing` ray.
+    origin's own. The searches that err are taken to have found the surface of their texel.
 
     Source: Oh & Ki 2006, displacement mapping with an image pyramid, as used by Kim, Ki, Lee
     & Oh ("descent"); Musgrave 1991, grid tracing; Brawley & Tatarchuk 2004 ("linear");
