@@ -3,16 +3,11 @@
 import inspect
 import re
 
-import jax
 import numpy as np
 import pytest
 
 from jaxfx import PinholeCamera
-from jaxfx.reproject import blend as blend_, choose as choose_, warp as warp_
-
-
-blend, warp = jax.jit(blend_), jax.jit(warp_)
-choose = jax.jit(choose_, static_argnames=("count", "shape"))
+from jaxfx.reproject import blend, choose, warp
 
 
 def camera(x=0.0, turn=0.0, height=16, width=24):
@@ -76,9 +71,9 @@ def test_the_choice_is_what_shows_most_and_then_what_it_lacks():
 
 
 FAULTS = {
-    "blend(images)": (blend_, {"images": []}),
-    "choose(depths)": (choose_, {"depths": []}),
-    "choose(count=...)": (choose_, {"count": 3}),
+    "blend(images)": (blend, {"images": []}),
+    "choose(depths)": (choose, {"depths": []}),
+    "choose(count=...)": (choose, {"count": 3}),
 }
 
 
@@ -88,6 +83,6 @@ def test_bad_arguments_are_named(name, fault):
     eye = camera()
     image, depth = box_before_a_wall(eye)
     given = {"depths": [depth], "sources": [eye], "target": eye}
-    given |= {"images": [image]} if function is blend_ else {"count": 1}
+    given |= {"images": [image]} if function is blend else {"count": 1}
     with pytest.raises(ValueError, match=re.escape(f"`{name}`")):
         inspect.unwrap(function)(**given | change)

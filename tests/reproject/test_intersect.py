@@ -258,8 +258,8 @@ def test_where_a_quick_method_fails(method, steps, make, slope, least):
 
 @pytest.mark.parametrize("method", ["linear", "relief"])
 def test_more_steps_err_less(method):
-    rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 32, 256)]
-    assert rates[0] > rates[1] > rates[2]
+    rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 64)]
+    assert rates[0] > 2 * rates[1]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -269,13 +269,13 @@ def test_no_method_errs_from_the_front(method):
 
 def test_steps_hardly_grow_with_the_size():
     mean = {}
-    for size in (64, 256):
+    for size in (32, 128):
         # The same picture in finer texels: the slant, in texels, grows with it.
-        origin, direction = slanted_rays(size, 6 * size / 64)
+        origin, direction = slanted_rays(size, 6 * size / 32)
         hit = run(smooth(size), origin, direction)
         inside = ((origin[:, :2] >= 0) & (origin[:, :2] < size)).all(axis=1)
         mean[size] = float(hit.steps[inside].mean())
-    assert mean[256] < 1.6 * mean[64]
+    assert mean[128] < 1.6 * mean[32]
 
 
 # The bilinear surface, and derivatives.
