@@ -241,7 +241,8 @@ class RelightState(eqx.Module):
         return _with_all(bare, self.lights, self.visibilities)
 
 
-def _check_lights(lights: Any) -> tuple[Light, ...]:
+def _check_lights(lights: Any) -> tuple[Any, ...]:
+    # Checked one by one by `checked`: a type checker at run time would meet some before it.
     if not isinstance(lights, Sequence):
         kind = type(lights).__name__
         raise ValueError(f"`start(lights)` must be a sequence of lights, got {kind}.")
