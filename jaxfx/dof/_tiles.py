@@ -60,6 +60,7 @@ def _stacked(value: Float[Array, "height width value"]) -> Float[Array, "value h
 
 
 def forward(reach: int, planes: Planes) -> Float[Array, "value height width"]:
+    """The sums themselves."""
     value, radius, leak, coc = planes
 
     def tap(cover, own, other):
@@ -74,6 +75,7 @@ def forward(reach: int, planes: Planes) -> Float[Array, "value height width"]:
 
 
 def tangent(reach: int, planes: Planes, dot: Planes) -> Float[Array, "value height width"]:
+    """Their derivative along `dot`."""
     value, radius, leak, coc = planes
 
     def tap(cover, slope, own, other):
@@ -93,6 +95,7 @@ def tangent(reach: int, planes: Planes, dot: Planes) -> Float[Array, "value heig
 
 
 def adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]) -> Planes:
+    """The transpose of `tangent`: one sweep owned by the sources, one by the destinations."""
     value, radius, leak, coc = planes
     sharp, blurring = 1 - clip01(coc - 1), inside(coc - 1)
 
@@ -124,6 +127,7 @@ def adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"])
 
 
 def plain(reach: int, planes: Planes) -> Float[Array, "value height width"]:
+    """The same sums by `shift`, which JAX can differentiate again."""
     value, radius, leak, coc = planes
     one = jnp.ones((), radius.dtype)
     return _stacked(shift(Sprites(jnp.moveaxis(value, 0, -1), radius, leak, coc, one), reach))
@@ -275,6 +279,11 @@ def _halos(reach: int) -> list[int]:
     runs = max(0, -(-(reach - NEAR) // RUN))
     grown = takewhile(lambda n: 2 * n < runs, (3**n for n in count()))
     return [0, NEAR, *(NEAR + n * RUN for n in grown)] + [NEAR + runs * RUN] * (runs > 0)
+
+
+def farthest(reach: int) -> int:
+    """How far along a row the runs go that hold what reaches so far."""
+    return _halos(reach)[-1]
 
 
 def _runs(reach: Int[Array, ""], row: Int[Array, ""]) -> Int[Array, ""]:

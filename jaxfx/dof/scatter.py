@@ -22,16 +22,16 @@ from jaxfx.dof._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
-from jaxfx.dof._tiles import tiles
+from jaxfx.dof._tiles import farthest, tiles
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
 Kernel = Literal["auto", "segment_sum", "shift", "tiles", "spans"]
 Coverage = Literal["area", "indicator"]
 
-# For `cheapest`: seconds, and three times nanoseconds a pixel.
+# For `cheapest`: seconds, and nanoseconds a pixel, a pixel's row, a tap that is computed.
 _SECONDS: dict[Any, tuple[float, float, float, float]] = {
-    "shift": (0.0, 5.0, 0.0, 1.5),
+    "shift": (0.0, 40.0, 0.0, 1.5),
     "tiles": (0.01, 20.0, 0.0, 0.5),
     "spans": (0.02, 80.0, 6.0, 0.0),
 }
@@ -267,15 +267,18 @@ def _quotient_jvp(primals, tangents):
 def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
     """The kernel that takes least for a picture whose every sprite is the largest.
 
-    Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows**2)`, with
-    `2 * reach + 1` rows; the constants were measured on two cores. What is fixed stands for the
+    Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows * columns)`, with
+    `2 * reach + 1` rows and, in tiles, as many columns as their runs of taps come to; the
+    constants were measured on two cores. What is fixed stands for the
     time that a kernel takes to compile, shared by a few dozen pictures.
     """
-    pixels, rows = height * width, 2 * reach(max_coc) + 1
+    pixels, far = height * width, reach(max_coc)
+    rows = 2 * far + 1
 
     def seconds(kernel: str) -> float:
         fixed, once, row, tap = _SECONDS[kernel]
-        return fixed + 1e-9 * pixels * (once + row * rows + tap * rows**2)
+        columns = 2 * farthest(far) + 1 if kernel == "tiles" else rows
+        return fixed + 1e-9 * pixels * (once + row * rows + tap * rows * columns)
 
     return min(_SECONDS, key=seconds)
 

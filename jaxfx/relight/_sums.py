@@ -38,6 +38,7 @@ class Sums(NamedTuple):
 
 
 def nothing(surface: Surface) -> Sums:
+    """The sums of no lights."""
     zero = jnp.zeros_like(surface.position)
     return Sums(Sum(zero, zero), Sum(zero, zero), jnp.zeros_like(surface.shader))
 
@@ -93,6 +94,7 @@ def _add(to: Sum, term: _Image) -> Sum:
 
 @jax.jit
 def image(surface, sums, ambient):
+    """The picture: the sums times what the surface reflects, ambient light added."""
     diffuse, specular = (part.total + part.lost for part in (sums.diffuse, sums.specular))
     image = surface.diffuse * diffuse + surface.specular * specular
     for light, visible in ambient:

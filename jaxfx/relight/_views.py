@@ -56,6 +56,7 @@ def read(
 
 
 def points(target: Camera, pixels: Float[Array, "height width 2"], depth: Scalars) -> Points:
+    """What a view with this depth shows; where its depth is no number, a point nobody uses."""
     known = (depth > 0) & jnp.isfinite(depth)
     depth = jnp.where(known, depth, 1)
     position = target.unproject(pixels, depth)
@@ -64,6 +65,7 @@ def points(target: Camera, pixels: Float[Array, "height width 2"], depth: Scalar
 
 
 def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) -> Found:
+    """What a cache has of the points, and which of them it sees: near enough, facing both."""
     height, width = gbuffer.depth.shape
     dtype = points.depth.dtype
     pixels, depth = camera.project(points.position)

@@ -6,6 +6,7 @@ in about three minutes. Nothing else should run meanwhile.
 
 import argparse
 import csv
+import itertools
 import statistics
 import time
 from pathlib import Path
@@ -79,15 +80,14 @@ def draw(rows, path):
                 label="native (numba)" if method == "native" else method,
                 **style,
             )
-    switch = next(r / 2 for r in range(1, 128) if cheapest(512, 512, float(r)) == "spans")
-    small = next(n for n in range(1, 4096) if cheapest(n, n, 16.0) != "shift")
-    for ax, at, names in (
-        (axes[0], switch, "tiles | spans"),
-        (axes[1], small, "shift | tiles"),
-    ):
-        ax.axvline(at, color="0.7", zorder=0)
-        low = {"transform": ax.get_xaxis_transform(), "ha": "center", "backgroundcolor": "w"}
-        ax.text(at, 0.03, f'"auto": {names}', color="0.4", fontsize=8, **low)
+    radii = [(r / 2, cheapest(512, 512, float(r))) for r in range(2, 129)]
+    sides = [(n, cheapest(n, n, 16.0)) for n in range(128, 2049)]
+    for ax, chosen in ((axes[0], radii), (axes[1], sides)):
+        for (_, one), (at, other) in itertools.pairwise(chosen):
+            if one != other:
+                ax.axvline(at, color="0.7", zorder=0)
+                low = {"transform": ax.get_xaxis_transform(), "ha": "center"}
+                ax.text(at, 0.02, f"auto:\n{one} | {other}", color="0.4", fontsize=7, **low)
     axes[0].set(
         xlabel="largest radius (pixels), 512 x 512", ylabel="time (ms, median of 3 to 9)"
     )

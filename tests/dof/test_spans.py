@@ -130,6 +130,8 @@ def test_the_cost_model_knows_who_is_quickest_where():
     module = importlib.import_module("jaxfx.dof.scatter")
     assert module.cheapest(64, 64, 8) == "shift"
     assert module.cheapest(512, 512, 8) == module.cheapest(512, 512, 16) == "tiles"
+    # Tiles go on by whole runs of taps: from the first on, spans are quicker.
+    assert module.cheapest(512, 512, 18) == "spans"
     assert module.cheapest(512, 512, 24) == module.cheapest(1024, 1024, 64) == "spans"
 
 
