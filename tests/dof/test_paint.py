@@ -1,0 +1,53 @@
+"""Discs painted by spans against their definition, and their adjoint against their tangent."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfx.dof._paint import BLOCK, paint, read_back
+from jaxfx.dof._sprites import coverage, row_half_width
+
+
+REACH = 5
+SHAPE = (BLOCK[0] + 3, BLOCK[1] + 2)
+
+
+def discs(seed):
+    rng = np.random.default_rng(seed)
+    value = jnp.asarray(rng.normal(size=(2, *SHAPE)))
+    radius = rng.uniform(0.5, REACH + 0.5, SHAPE) * (rng.random(SHAPE) < 0.3)
+    return value, jnp.asarray(radius)
+
+
+def test_one_disc_is_its_coverage():
+    for row, column in ((0, 0), (BLOCK[0], BLOCK[1] - 1), (SHAPE[0] - 1, SHAPE[1] - 1)):
+        value = jnp.zeros((1, *SHAPE)).at[0, row, column].set(2.0)
+        radius = jnp.zeros(SHAPE).at[row, column].set(3.7)
+        painted = np.asarray(paint(REACH, value, radius))[0]
+        expected = np.zeros(SHAPE)
+        for y in range(max(0, row - 5), min(SHAPE[0], row + 6)):
+            width = row_half_width(jnp.asarray(3.7), y - row)
+            for x in range(max(0, column - 5), min(SHAPE[1], column + 6)):
+                expected[y, x] = 2 * coverage(width, x - column)
+        np.testing.assert_allclose(painted, expected, atol=1e-12)
+
+
+def test_the_tangent_is_the_difference_quotient():
+    (value, radius), dot = discs(0), discs(1)
+    dot = dot[0], jnp.where(radius > 0.6, dot[1], 0)
+    step = 1e-7
+    ends = [paint(REACH, value + h * dot[0], radius + h * dot[1]) for h in (step, -step)]
+    tangent = paint(REACH, value, radius, dot)
+    np.testing.assert_allclose(tangent, (ends[0] - ends[1]) / (2 * step), atol=2e-6)
+
+
+def test_reading_back_is_the_transpose():
+    (value, radius), dot = discs(2), discs(3)
+    bar = jnp.asarray(np.random.default_rng(4).normal(size=value.shape))
+    nothing = jnp.zeros_like(value), jnp.zeros_like(radius)
+    bars = read_back(REACH, value, radius, bar, nothing)
+    pushed = jnp.vdot(paint(REACH, value, radius, dot), bar)
+    pulled = sum(map(jnp.vdot, dot, bars))
+    np.testing.assert_allclose(pushed, pulled, rtol=1e-11)
+    again = jax.tree.map(lambda x, y: x - y, read_back(REACH, value, radius, bar, bars), bars)
+    np.testing.assert_allclose(again[0], bars[0], atol=1e-12)
