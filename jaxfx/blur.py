@@ -240,55 +240,118 @@ def _reads(weights: Float[Array, "taps"]) -> list[tuple[int, Array, Array]]:
 Tap = Callable[[int], Array]
 
 
-def _discrete(weights: Float[Array, "taps"], tap: Tap) -> Array:
-    """The weighted sum of symmetric taps: two that share a weight are added first."""
+def _discrete(weights: Float[Array, "taps"], tap: Tap) -> list[Callable[[], Array]]:
+    """The terms of the weighted sum: two taps that share a weight are added first."""
     last = weights.size - 1
-    pairs = [weights[i] * (tap(i) + tap(last - i)) for i in range(weights.size // 2)]
-    middle = [weights[last // 2] * tap(last // 2)] if weights.size % 2 else []
-    return ft.reduce(jnp.add, middle + pairs)
+    pairs = [lambda i=i: weights[i] * (tap(i) + tap(last - i)) for i in range(weights.size // 2)]
+    middle = [lambda: weights[last // 2] * tap(last // 2)] if weights.size % 2 else []
+    return middle + pairs
 
 
-def _linear(weights: Float[Array, "taps"], tap: Tap) -> Array:
-    """The same sum by half as many reads, each interpolated between two taps."""
+def _linear(weights: Float[Array, "taps"], tap: Tap) -> list[Callable[[], Array]]:
+    """The terms of the same sum by half as many reads, each between two taps."""
 
     def read(i: int, share: Array, is_lone: bool) -> Array:
         return tap(i) if is_lone else tap(i) + share * (tap(i + 1) - tap(i))
 
     middle = weights.size // 2 if weights.size % 4 == 1 else -1
-    return ft.reduce(
-        jnp.add,
-        [weight * read(i, share, i == middle) for i, share, weight in _reads(weights)],
+    return [
+        lambda i=i, share=share, weight=weight: weight * read(i, share, i == middle)
+        for i, share, weight in _reads(weights)
+    ]
+
+
+_TERMS = {"discrete": _discrete, "linear": _linear}
+
+
+def _added(terms: list[Callable[[], Array]]) -> Array:
+    return ft.reduce(jnp.add, [term() for term in terms])
+
+
+def _added_in_groups(terms: list[Callable[[], Array]]) -> Array:
+    """The same sum, some terms at a time.
+
+    XLA takes what more than 16 slices of one array read through memory, slice by slice; the
+    branches of a switch it leaves apart.
+    """
+    groups = [terms[i : i + _GROUP] for i in range(0, len(terms), _GROUP)]
+    if len(groups) == 1:
+        return _added(terms)
+    branches = [lambda total, group=group: total + _added(group) for group in groups]
+    shape = jax.eval_shape(terms[0])
+    return lax.fori_loop(
+        0,
+        len(groups),
+        lambda i, total: lax.switch(i, branches, total),
+        jnp.zeros(shape.shape, shape.dtype),
     )
 
 
-_SUMS = {"discrete": _discrete, "linear": _linear}
-
-
 @ft.partial(jax.jit, static_argnames=("passes", "sampling"))
-def _blur(image, weights, passes, sampling):
-    dtype = image.dtype
-    image = image.astype(working_dtype(dtype))
-    weights = weights.astype(image.dtype)
-    return lax.fori_loop(
-        0, passes, lambda _, image: _pass(sampling, image, weights), image
-    ).astype(dtype)
+def _binomial_blur(image, weights, passes, sampling):
+    return _repeated(lambda image: _filter(sampling, image, weights, weights), image, passes)
+
+
+@ft.partial(jax.jit, static_argnames=("taps", "passes", "sampling"))
+def _gaussian_blur(image, sigma, taps, passes, sampling):
+    one = ft.partial(_gaussian_pass, sampling, taps, passes)
+    return _repeated(lambda image: one(image, sigma), image, passes)
+
+
+def _repeated(one_pass, image, passes):
+    working = image.astype(working_dtype(image.dtype))
+    working = lax.fori_loop(0, passes, lambda _, image: one_pass(image), working)
+    return working.astype(image.dtype)
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def _gaussian_pass(
+    sampling: Sampling, taps: int, passes: int, image: Float[Array, "h w c"], sigma: Float[Array, ""]
+) -> Float[Array, "h w c"]:
+    """One of several passes that together have the standard deviation `sigma`."""
+    weights = _gaussian_weights(taps, sigma, passes).astype(image.dtype)
+    return _filter(sampling, image, weights, weights)
+
+
+@ft.partial(_gaussian_pass.defjvp, symbolic_zeros=True)
+def _(sampling, taps, passes, primals, tangents):
+    # By `sigma` itself, not by each weight: one picture says how it changes the result.
+    (image, sigma), (image_dot, sigma_dot) = primals, tangents
+    out = _gaussian_pass(sampling, taps, passes, image, sigma)
+    weights_of = lambda sigma: _gaussian_weights(taps, sigma, passes).astype(image.dtype)
+    weights, slopes = jax.jvp(weights_of, (sigma,), (jnp.ones_like(sigma),))
+    dot = _filter_tangent(image_dot, weights, weights)
+    if not isinstance(sigma_dot, SymbolicZero):
+        along = _filter("discrete", image, slopes, weights)
+        along = along + _filter("discrete", image, weights, slopes)
+        dot = dot + sigma_dot.astype(image.dtype) * along
+    return out, dot
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _pass(
-    sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
+def _filter(
+    sampling: Sampling,
+    image: Float[Array, "h w c"],
+    down: Float[Array, "taps"],
+    across: Float[Array, "taps"],
 ) -> Float[Array, "h w c"]:
-    """One pass down the columns and one along the rows."""
-    if weights.size == 1 or image.shape[1] < weights.size:
-        return _padded(sampling, image, weights)
-    return _unpadded(sampling, image, weights)
+    """Down the columns, then along the rows, by symmetric weights."""
+    down, across = down.astype(image.dtype), across.astype(image.dtype)
+    if down.size == 1 or image.shape[1] < down.size:
+        return _padded(sampling, image, down, across)
+    return _unpadded(sampling, image, down, across)
 
 
-@_pass.defjvp
+@ft.partial(_filter.defjvp, symbolic_zeros=True)
 def _(sampling, primals, tangents):
-    # Both samplings are the same sum.
-    _, dot = jax.jvp(ft.partial(_padded, "discrete"), primals, tangents)
-    return _pass(sampling, *primals), dot
+    (image, *weights), (image_dot, *weights_dot) = primals, tangents
+    dot = _filter_tangent(image_dot, *weights)
+    if any(not isinstance(each, SymbolicZero) for each in weights_dot):
+        # Asked for by second derivatives in `sigma` alone.
+        weights_dot = [materialize(each) for each in weights_dot]
+        by_weights = ft.partial(_padded, "discrete", image)
+        dot = dot + jax.jvp(by_weights, tuple(weights), tuple(weights_dot))[1]
+    return _filter(sampling, *primals), dot
 
 
 def _padded(

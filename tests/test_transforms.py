@@ -4,13 +4,14 @@ Functions are found by themselves, their arguments by name in `EXAMPLES`, and th
 option by its `Literal` annotation. Values are checked elsewhere, against independent oracles.
 """
 
+import dataclasses
 import functools
 import importlib
 import inspect
 import itertools
 import pkgutil
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import equinox as eqx
 import jax
@@ -160,11 +161,16 @@ EXAMPLES = {
 }
 
 
-class Case(NamedTuple):
-    """A function, and for each parameter an option's value or one of the examples."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Case:
+    """A function, and for each parameter an option's value or one of the examples.
+
+    `is_option` says that it differs from another case by an option, not by a type of argument.
+    """
 
     function: Any
     choice: dict
+    is_option: bool = True
 
     def split(
         self,
@@ -264,10 +270,12 @@ def _cases(name, function):
         chosen = {p: choices[p][i] for p, i in zip(choices, row, strict=True)}
         if new and _is_accepted(case := Case(function, chosen)):
             missing -= new
+            varied = [chosen[p] for p, i in sorted(new) if i]
             labels = [
                 f"{p}={getattr(chosen[p], '__name__', chosen[p])}" for p, i in sorted(new) if i
             ]
-            cases["-".join([name, *labels])] = case
+            is_option = not varied or not all(map(callable, varied))
+            cases["-".join([name, *labels])] = dataclasses.replace(case, is_option=is_option)
     return cases, [f"an accepted call with `{p}={choices[p][i]!r}`" for p, i in sorted(missing)]
 
 
@@ -278,9 +286,25 @@ for _name, _function in FUNCTIONS.items():
     CASES |= _found
 
 # Compiling is most of the work. `test_jit` does it as a user does; the others may save on it.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+quick_jit = functools.partial(
+    jax.jit,
+    compiler_options={
+        "xla_backend_optimization_level": 0,
+        "xla_cpu_use_fusion_emitters": False,
+    },
+)
 
-each_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+
+def each(cases):
+    """Parametrize by cases, so that a case's tests follow one another and share `program`."""
+    return pytest.mark.parametrize("case", cases.values(), ids=cases.keys(), scope="module")
+
+
+@functools.lru_cache(maxsize=1)
+def program(case):
+    """The function of a case, compiled; as it is; and its arguments."""
+    call, arguments = case.split(eqx.is_array)
+    return jax.jit(call), call, arguments
 
 
 def _normal(tree, seed=7):
@@ -309,35 +333,35 @@ def test_every_argument_and_choice_is_exercised(name):
     assert not MISSING[name], f"`{name}` needs {', '.join(MISSING[name])}"
 
 
-@each_case
+@each(CASES)
 def test_jit(case):
-    call, arguments = case.split(eqx.is_array)
-    _assert_close(jax.jit(call)(arguments), call(arguments))
+    compiled, call, arguments = program(case)
+    _assert_close(compiled(arguments), call(arguments))
 
 
-@each_case
+@each(CASES)
 def test_vmap_is_a_loop(case):
-    call, one = case.split(eqx.is_array)
+    compiled, call, one = program(case)
     _, two = case.split(eqx.is_array, seed=1)
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), one, two)
-    loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), call(one), call(two))
-    _assert_close(jax.vmap(call)(batch), loop)
+    loop = jax.tree.map(lambda *leaves: jnp.stack(leaves), compiled(one), compiled(two))
+    _assert_close(quick_jit(jax.vmap(call))(batch), loop)
 
 
-@each_case
+@each(CASES)
 @pytest.mark.parametrize("parameters", [np.float32, np.float64])
 def test_float32_stays_and_is_close_to_float64(case, parameters):
     call, arguments = case.split(dtype=np.float32, parameters=parameters)
-    double, same = case.split()
-    out = call(arguments)
+    compiled, _, same = program(case)
+    out = quick_jit(call)(arguments)
     # What is made of vectors alone keeps their type.
     has_image = any(leaf.ndim >= 2 for leaf in jax.tree.leaves(arguments))
     dtype = np.dtype(np.float32 if has_image else parameters)
     assert {leaf.dtype for leaf in jax.tree.leaves(out)} <= {dtype}
-    _assert_close(out, double(same), tolerance=1e-4)
+    _assert_close(out, eqx.filter(compiled(same), eqx.is_inexact_array), tolerance=1e-4)
 
 
-@each_case
+@each(CASES)
 def test_derivatives_agree(case):
     """Forward, linearized and reverse, with one another and with the difference quotient."""
     call, arguments = case.split()
@@ -359,35 +383,37 @@ def test_derivatives_agree(case):
     if case.choice.get("method") in ROUGH:
         return
 
-    value = quick_jit(call)
+    compiled, _, everything = program(case)
 
     def moved(step):
-        return value(jax.tree.map(lambda x, v: x + step * v, arguments, along))
+        floats = jax.tree.map(lambda x, v: x + step * v, arguments, along)
+        return eqx.filter(compiled(eqx.combine(floats, everything)), eqx.is_inexact_array)
 
     quotient = jax.tree.map(lambda a, b: (a - b) / 2e-6, moved(1e-6), moved(-1e-6))
     _assert_close(pushed, quotient, tolerance=1e-5)
 
 
-@each_case
+# What differs by a type of argument alone goes through the same code.
+OPTIONS = {name: case for name, case in CASES.items() if case.is_option}
+
+# A score of a picture may need a whole window of it; a picture may have any size.
+PICTURES = {name: case for name, case in OPTIONS.items() if not name.startswith("metrics.")}
+
+
+@each(OPTIONS)
 def test_nested_gradient_is_finite(case):
     call, arguments = case.split()
     along = _normal(arguments)
 
-    def energy(arguments):
-        out = call(arguments)
-        return _dot(out, out)
-
     def slope(arguments):
-        return _dot(jax.grad(energy)(arguments), along)
+        """The derivative of an energy, whose gradient is a column of the Hessian."""
+        out, pushed = jax.jvp(call, (arguments,), (along,))
+        return _dot(out, pushed)
 
     _assert_finite(quick_jit(jax.grad(slope))(arguments))
 
 
-# A score of a picture may need a whole window of it; a picture may have any size.
-PICTURES = {name: case for name, case in CASES.items() if not name.startswith("metrics.")}
-
-
-@pytest.mark.parametrize("case", PICTURES.values(), ids=PICTURES.keys())
+@each(PICTURES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 7)], ids="{0[0]}x{0[1]}".format)
 def test_any_size(case, size):
     call, arguments = case.split(size=size)

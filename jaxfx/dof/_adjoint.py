@@ -5,9 +5,10 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array
+
+from jaxfx._linear import linear
 
 
 Planes = TypeVar("Planes", bound=Any)
@@ -40,23 +41,10 @@ def with_adjoint(
         push = sequential_vmap(ft.partial(tangent, reach))
         pull = sequential_vmap(ft.partial(adjoint, reach))
 
-        # The tangent is linear, S say, and its transpose a kernel of its own. JAX is told so by
-        # the one call that takes both and can be mapped, transposed and differentiated: the
-        # solve of (u, v - S u) = b, which is (u, v + S u), and for the adjoint (u + S^T v, v).
-        # The system itself is wanted by second derivatives only, and may be slow.
-        def matvec(b):
-            return b[0], b[1] - jax.jvp(ft.partial(plain, reach), (planes,), (b[0],))[1]
+        def derivative(dot):
+            return jax.jvp(ft.partial(plain, reach), (planes,), (dot,))[1]
 
-        def solve(_, b):
-            return b[0], b[1] + push(planes, b[0])
-
-        def solve_transposed(_, b):
-            return jax.tree.map(jnp.add, b[0], pull(planes, b[1])), b[1]
-
-        # It is transposed in the whole of b: what has no tangent borrows a zero from what has.
-        zero = sum(jnp.where(False, leaf.ravel()[0], 0) for leaf in jax.tree.leaves(dot))
-        b = jax.tree.map(lambda x: x + zero, (dot, jnp.zeros_like(planes.value)))
-        _, out = jax.lax.custom_linear_solve(matvec, b, solve, solve_transposed)
+        out = linear(ft.partial(push, planes), ft.partial(pull, planes), derivative, dot)
         return kernel(reach, planes), out
 
     return kernel

@@ -83,8 +83,8 @@ def _row_half_width_jvp(primals, tangents):
 def _segment_polynomial(degree: int) -> tuple[float, ...]:
     """P, lowest power first, in `area(1 - x) = pi / 4 - x**1.5 P(x)` for x in [0, 1].
 
-    `area(s)` is the integral of `sqrt(1 - t**2)` from 0 to s. With `t = 1 - x v` what is left of
-    it to 1 is `x**1.5` times the integral of `sqrt(v) sqrt(2 - x v)` over v in [0, 1], whose
+    `area(s)` is the integral of `sqrt(1 - t**2)` from 0 to s. With `t = 1 - x v` the rest,
+    up to 1, is `x**1.5` times the integral of `sqrt(v) sqrt(2 - x v)` over v in [0, 1], whose
     binomial series is summed at the nodes of a Chebyshev fit. The nearest branch point is at
     x = 2, so that the fit's error falls by a factor of 5.8 a degree.
     """
