@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfx._linear import linear
 from jaxfx._numerics import check, check_image, parameter, working_dtype
 
 
@@ -21,6 +23,8 @@ Sampling = Literal["discrete", "linear"]
 
 # A variance below this, in pixels squared, is this: no neighbour's weight exceeds e**-500.
 _SMALLEST_VARIANCE = 1e-3
+# So many pairs of taps are read at once.
+_GROUP = 8
 
 
 def gaussian(
@@ -83,15 +87,14 @@ def gaussian(
         )
     if sigma is None:
         weights = _binomial("gaussian", taps, taps + 3 if row is None else row)
-    elif row is None:
-        sigma = parameter("gaussian(sigma=...)", sigma)
-        check("gaussian(sigma=...)", sigma, lambda v: v >= 0, "0 or positive")
-        weights = _gaussian_weights(taps, sigma, passes)
-    else:
+        return _binomial_blur(image, jnp.asarray(weights), passes, sampling)
+    if row is not None:
         raise ValueError(
             f"`gaussian(row=...)` must be left out where `sigma` is given, got {row}."
         )
-    return _blur(image, jnp.asarray(weights), passes, sampling)
+    sigma = parameter("gaussian(sigma=...)", sigma)
+    check("gaussian(sigma=...)", sigma, lambda v: v >= 0, "0 or positive")
+    return _gaussian_blur(image, sigma, taps, passes, sampling)
 
 
 def binomial_weights(taps: int, *, row: int) -> Float[Array, "taps"]:
@@ -243,7 +246,9 @@ Tap = Callable[[int], Array]
 def _discrete(weights: Float[Array, "taps"], tap: Tap) -> list[Callable[[], Array]]:
     """The terms of the weighted sum: two taps that share a weight are added first."""
     last = weights.size - 1
-    pairs = [lambda i=i: weights[i] * (tap(i) + tap(last - i)) for i in range(weights.size // 2)]
+    pairs = [
+        lambda i=i: weights[i] * (tap(i) + tap(last - i)) for i in range(weights.size // 2)
+    ]
     middle = [lambda: weights[last // 2] * tap(last // 2)] if weights.size % 2 else []
     return middle + pairs
 
@@ -306,7 +311,11 @@ def _repeated(one_pass, image, passes):
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _gaussian_pass(
-    sampling: Sampling, taps: int, passes: int, image: Float[Array, "h w c"], sigma: Float[Array, ""]
+    sampling: Sampling,
+    taps: int,
+    passes: int,
+    image: Float[Array, "h w c"],
+    sigma: Float[Array, ""],
 ) -> Float[Array, "h w c"]:
     """One of several passes that together have the standard deviation `sigma`."""
     weights = _gaussian_weights(taps, sigma, passes).astype(image.dtype)
@@ -322,8 +331,14 @@ def _(sampling, taps, passes, primals, tangents):
     weights, slopes = jax.jvp(weights_of, (sigma,), (jnp.ones_like(sigma),))
     dot = _filter_tangent(image_dot, weights, weights)
     if not isinstance(sigma_dot, SymbolicZero):
-        along = _filter("discrete", image, slopes, weights)
-        along = along + _filter("discrete", image, weights, slopes)
+        # One after the other: two filters that read one image side by side are slow.
+        both = jnp.stack([weights, slopes])
+        along = lax.fori_loop(
+            0,
+            2,
+            lambda i, along: along + _filter("discrete", image, both[i], both[1 - i]),
+            jnp.zeros_like(image),
+        )
         dot = dot + sigma_dot.astype(image.dtype) * along
     return out, dot
 
@@ -348,29 +363,67 @@ def _(sampling, primals, tangents):
     dot = _filter_tangent(image_dot, *weights)
     if any(not isinstance(each, SymbolicZero) for each in weights_dot):
         # Asked for by second derivatives in `sigma` alone.
-        weights_dot = [materialize(each) for each in weights_dot]
+        weights_dot = [
+            jnp.zeros(each.shape, each.dtype) if isinstance(each, SymbolicZero) else each
+            for each in weights_dot
+        ]
         by_weights = ft.partial(_padded, "discrete", image)
         dot = dot + jax.jvp(by_weights, tuple(weights), tuple(weights_dot))[1]
     return _filter(sampling, *primals), dot
 
 
+def _filter_tangent(
+    dot: Float[Array, "h w c"] | SymbolicZero, *weights: Float[Array, "taps"]
+) -> Float[Array, "h w c"]:
+    """The filter of an image's tangent, to be transposed as quickly as it is computed."""
+    if isinstance(dot, SymbolicZero):
+        return jnp.zeros(dot.shape, dot.dtype)
+    push = lambda x: _filter("discrete", x, *weights)
+    plain = lambda x: _padded("discrete", x, *weights)
+    if min(dot.shape[:2]) < weights[0].size:
+        return plain(dot)
+    return linear(push, lambda bar: _transposed(bar, *weights), plain, dot)
+
+
+def _transposed(
+    bar: Float[Array, "h w c"], *weights: Float[Array, "taps"]
+) -> Float[Array, "h w c"]:
+    """The transpose of `_filter`: itself, but what leaves the frame returns to its border."""
+    half = weights[0].size // 2
+    wide = jnp.pad(bar, ((half, half), (half, half), (0, 0)))
+    wide = _filter("discrete", wide, *weights)
+    for axis in (0, 1):
+        first, inside, last = jnp.split(wide, (half + 1, wide.shape[axis] - half - 1), axis)
+        ends = (jnp.sum(end, axis, keepdims=True) for end in (first, last))
+        wide = jnp.concatenate([next(ends), inside, next(ends)], axis)
+    return wide
+
+
 def _padded(
-    sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
+    sampling: Sampling,
+    image: Float[Array, "h w c"],
+    down: Float[Array, "taps"],
+    across: Float[Array, "taps"],
 ) -> Float[Array, "h w c"]:
     """By copies with a margin: for small images, and for JAX to differentiate."""
     height, width, channels = image.shape
-    total, half = ft.partial(_SUMS[sampling], weights), weights.size // 2
+    half, terms = down.size // 2, _TERMS[sampling]
     margin = ((half, half), (half, half), (0, 0))
     wide = jnp.pad(image, margin, mode="edge").reshape(height + 2 * half, -1)
-    columns = total(lambda i: lax.slice_in_dim(wide, i, i + height))
+    columns = _added(terms(down, lambda i: lax.slice_in_dim(wide, i, i + height)))
     row = width * channels
-    return total(
-        lambda i: lax.slice_in_dim(columns, i * channels, i * channels + row, axis=1)
-    ).reshape(image.shape)
+
+    def beside(i: int) -> Array:
+        return lax.slice_in_dim(columns, i * channels, i * channels + row, axis=1)
+
+    return _added(terms(across, beside)).reshape(image.shape)
 
 
 def _unpadded(
-    sampling: Sampling, image: Float[Array, "h w c"], weights: Float[Array, "taps"]
+    sampling: Sampling,
+    image: Float[Array, "h w c"],
+    down: Float[Array, "taps"],
+    across: Float[Array, "taps"],
 ) -> Float[Array, "h w c"]:
     """Without a copy of the image: it is read once and written once by each pass.
 
@@ -378,26 +431,26 @@ def _unpadded(
     row at either border. There the result is computed apart, in two strips, and then put in.
     """
     height, width, channels = image.shape
-    total, half = ft.partial(_SUMS[sampling], weights), weights.size // 2
+    half, terms = down.size // 2, _TERMS[sampling]
     row, reach = width * channels, half * channels
 
-    columns = _columns(total, image.reshape(height, row), half).reshape(-1)
+    columns = _columns(ft.partial(terms, down), image.reshape(height, row), half).reshape(-1)
 
     def moved(i: int) -> Array:
         start = row + (i - half) * channels
         return lax.slice_in_dim(columns, start, start + height * row)
 
-    whole = total(moved).reshape(height, row)
+    whole = _added_in_groups(terms(across, moved)).reshape(height, row)
 
     edges = [jnp.repeat(image[:, i : i + 1], half, axis=1) for i in (0, width - 1)]
     ends = [image[:, : 2 * half], image[:, width - 2 * half :]]
     sides = jnp.concatenate([edges[0], *ends, edges[1]], axis=1).reshape(height, -1)
-    sides = _columns(total, sides, half)
+    sides = _columns(ft.partial(terms, down), sides, half)
 
     def beside(i: int) -> Array:
         return lax.slice_in_dim(sides, i * channels, i * channels + 4 * reach, axis=1)
 
-    sides = total(beside)
+    sides = _added_in_groups(terms(across, beside))
 
     # In a loop: outside of one, XLA computes the whole again to put a strip into it.
     def put(i: Array, whole: Array) -> Array:
@@ -408,7 +461,7 @@ def _unpadded(
 
 
 def _columns(
-    total: Callable[[Tap], Array], flat: Float[Array, "h wc"], half: int
+    terms: Callable[[Tap], list[Callable[[], Array]]], flat: Float[Array, "h wc"], half: int
 ) -> Float[Array, "h+2 wc"]:
     """The pass down the columns, with a row of zeros above and one below.
 
@@ -418,7 +471,9 @@ def _columns(
     height = flat.shape[0]
     indices = np.arange(height)[:, None] + np.arange(-half, half + 1)
     indices = jnp.asarray(indices.clip(0, height - 1))
-    sums = total(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
+    sums = _added_in_groups(
+        terms(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
+    )
     return lax.pad(sums, jnp.zeros((), flat.dtype), ((1, 1, 0), (0, 0, 0)))
 
 
@@ -443,4 +498,4 @@ def _halved(
     def tap(i: int) -> Array:
         return lax.slice_in_dim(wide, i, i + length - 1, 2, axis)
 
-    return _discrete(weights, tap)
+    return _added(_discrete(weights, tap))

@@ -13,6 +13,7 @@ radius. A running sum begins anew with each block, so that what it rounds stays 
 What it does not do well: scattered writes use one core.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -77,20 +78,23 @@ def read_back(
     radius: Float[Array, "height width"],
     bar: Float[Array, "value height width"],
     bars: tuple[Float[Array, "value height width"], Float[Array, "height width"]],
+    weight: Float[Array, "height width"] | None = None,
 ) -> tuple[Float[Array, "value height width"], Float[Array, "height width"]]:
-    """The adjoint of `paint` at `bar`, added to `bars`, those of value and radius.
+    """The adjoint of `paint`, times `weight`, at `bar`, added to `bars`, of value and radius.
 
     Each step is read where it was written: A from the sums to come, B as it is.
     """
     blocks = _Blocks(reach, radius)
     values = len(value)
     planes = [*map(blocks.whole, (value, radius))]
-    bar = blocks.windowed(bar)
+    # The weight by itself: several calls share what their `bar` fills in memory.
+    windows = [blocks.windowed(x) for x in ([bar] if weight is None else [bar, weight[None]])]
 
     def read_block(index, bars):
         value, radius = (blocks.cut(x, index) for x in planes)
         flat = _flat(value)
-        seen = jnp.moveaxis(blocks.cut(bar, index, window=True), 0, -1)
+        seen = math.prod(blocks.cut(x, index, window=True) for x in windows)
+        seen = jnp.moveaxis(seen, 0, -1)
         steps = jnp.concatenate([jax.lax.cumsum(seen, axis=1, reverse=True), seen], axis=-1)
         steps = jnp.pad(steps, ((0, 1), (0, 0), (0, 0))).reshape(-1, 2 * values)
 

@@ -93,7 +93,7 @@ def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]
         jnp.where(direct, near_bar.radius, 0),
     )
     bars = read_back(reach, value, before, bar, bars)
-    bars = read_back(reach, value, behind, blurred[None] * bar, bars)
+    bars = read_back(reach, value, behind, bar, bars, blurred)
     coc_bar = near_bar.coc + _tiles.inside(planes.coc - 1) * blurred_bar
     return Planes(*bars, near_bar.leak, coc_bar)
 

@@ -1,5 +1,6 @@
 """Parameters of the effects from pictures, by optimistix."""
 
+from jaxfx.fit.camera import CameraFit, camera
 from jaxfx.fit.dof import PARAMETERS, DofFit, dof
 from jaxfx.fit.lights import LIGHT_PARAMETERS, LightsFit, lights
 from jaxfx.fit.moving_shadow import MovingShadow
@@ -8,9 +9,11 @@ from jaxfx.fit.moving_shadow import MovingShadow
 __all__ = [
     "LIGHT_PARAMETERS",
     "PARAMETERS",
+    "CameraFit",
     "DofFit",
     "LightsFit",
     "MovingShadow",
+    "camera",
     "dof",
     "lights",
 ]

@@ -5,7 +5,6 @@ bit is found by halving, first among the words, then inside one. A loop does the
 chunk, and ends with the last: where no bit is set, nothing is done.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 _BITS = 32
 _CHUNK = 4096
-_MANY = jnp.iinfo(jnp.int32).max
 
 
 def replace(
@@ -59,7 +57,7 @@ def _nth_set(
     words: UInt32[Array, " word"], ends: Int[Array, " word"], rank: Int[Array, " chunk"]
 ) -> Int[Array, " chunk"]:
     """The index of the bit that so many set ones stand before; anything beyond the last."""
-    at = jnp.minimum(_count_up_to(ends, rank), words.size - 1)
+    at = jnp.minimum(jnp.searchsorted(ends, rank, side="right"), words.size - 1)
     word = words[at]
     rank = rank - (ends[at] - jax.lax.population_count(word).astype(jnp.int32))
     bit = jnp.zeros_like(rank)
@@ -71,18 +69,3 @@ def _nth_set(
         word = jnp.where(is_above, word >> half, word)
         bit = jnp.where(is_above, bit + half, bit)
     return at * _BITS + bit
-
-
-def _count_up_to(ends: Int[Array, " word"], rank: Int[Array, " chunk"]) -> Int[Array, " chunk"]:
-    """How many of the ascending `ends` are `rank` or less.
-
-    Among every root-th of them first, then among the root that follow: halving would take more
-    steps, each a kernel of its own.
-    """
-    root = math.isqrt(ends.size - 1) + 1
-    table = jnp.pad(ends, (0, root * root - ends.size), constant_values=_MANY)
-    table = table.reshape(root, root)
-    block = jnp.sum(table[:, -1][None] <= rank[:, None], axis=1, dtype=jnp.int32)
-    block = jnp.minimum(block, root - 1)
-    inside = jnp.sum(table[block] <= rank[:, None], axis=1, dtype=jnp.int32)
-    return block * root + inside

@@ -178,7 +178,7 @@ def _prepare(size, mask, dilation, shadow_map, receivers, bias, slope_bias, soft
     places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
     if mask == "screen":
         hard = average(texels, places, None, 1, "box")
-        return texels, places, _screen_mask(hard, dilation), hard
+        return texels, _screen_mask(hard, dilation), hard
     index = places.row * texels.shape[1] + places.column
     smallest, largest = (
         each.reshape(-1).at[index].get(mode="promise_in_bounds")
@@ -190,12 +190,13 @@ def _prepare(size, mask, dilation, shadow_map, receivers, bias, slope_bias, soft
         half = _taps.half_width(softness, dtype)
         all_lit = smallest - places.threshold >= half
         any_lit = largest - places.threshold > -half
-    return texels, places, all_lit != any_lit, all_lit.astype(dtype)
+    value = (all_lit.astype(dtype) + any_lit.astype(dtype)) / 2
+    return texels, value == 0.5, value
 
 
 @ft.partial(jax.jit, static_argnums=(0, 1, 2))
 def _candidates(size, mask, dilation, *data):
-    return _prepare(size, mask, dilation, *jax.lax.stop_gradient(data))[2]
+    return _prepare(size, mask, dilation, *jax.lax.stop_gradient(data))[1]
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
@@ -204,11 +205,14 @@ def _masked(size, kernel, mask, dilation, shadow_map, receivers, bias, slope_bia
     @sequential_vmap
     def run(shadow_map, receivers, bias, slope_bias, softness):
         data = (shadow_map, receivers, bias, slope_bias, softness)
-        texels, places, where, value = _prepare(size, mask, dilation, *data)
-        flat = Places(*(each.reshape(-1) for each in places))
+        texels, where, value = _prepare(size, mask, dilation, *data)
+        flat = Receivers(*(each.reshape(-1) for each in receivers))
 
         def fetch(pixels):
-            return Places(*(each[pixels] for each in flat))
+            chunk = Receivers(*(each[pixels] for each in flat))
+            return _taps.find_places(
+                chunk, bias, slope_bias, shadow_map.shape, size, texels.dtype
+            )
 
         def compute(chunk: Any):
             return average(texels, chunk, softness, size, kernel)
