@@ -49,6 +49,11 @@ def tiles(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
     return jnp.moveaxis(_sums(reach, to_planes(sprites)), 0, -1)
 
 
+def shifts(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
+    """The sums by `shift`, with the derivatives of `tiles`, which are quicker than its own."""
+    return jnp.moveaxis(_shifted(reach, to_planes(sprites)), 0, -1)
+
+
 def to_planes(sprites: Sprites) -> Planes:
     """The sprites as the kernel reads them."""
     value, radius, leak, coc, epsilon = sprites
@@ -134,6 +139,7 @@ def plain(reach: int, planes: Planes) -> Float[Array, "value height width"]:
 
 
 _sums = with_adjoint(forward, tangent, adjoint, plain)
+_shifted = with_adjoint(plain, tangent, adjoint, plain)
 
 
 def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -22,7 +22,7 @@ from jaxfx.dof._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
-from jaxfx.dof._tiles import farthest, tiles
+from jaxfx.dof._tiles import farthest, shifts, tiles
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
@@ -244,7 +244,7 @@ def _blurred(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     if kernel == "segment_sum":
         sums = segment_sum(sprites, reach(max_coc), coverage)
     else:
-        kernels = {"shift": shift, "tiles": tiles, "spans": spans}
+        kernels = {"shift": shifts, "tiles": tiles, "spans": spans}
         sums = kernels[kernel](sprites, reach(max_coc))
     return _quotient(sums)
 
