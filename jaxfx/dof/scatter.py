@@ -89,9 +89,10 @@ def scatter(
     a negative `gamma` or `epsilon`, an unknown option, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
-    `lens`, silhouettes included, forward and reverse. Zero where a sprite is clamped. At a kink
-    (the focus plane, the ends of both clamps) one of the two one-sided values. With
-    `coverage="indicator"` the derivative of the coverage, almost everywhere zero, is missing.
+    `lens`, silhouettes included, forward and reverse; again by `jax.jacfwd(jax.grad(loss))`,
+    which `jax.hessian` is. Zero where a sprite is clamped. At a kink (the focus plane, the ends
+    of both clamps) one of the two one-sided values. With `coverage="indicator"` the derivative
+    of the coverage, almost everywhere zero, is missing.
 
     Source: Lee, Kim & Choi, real-time depth of field rendering using pixel intensity scatter on
     GPU, sections 3 and 4; the model is that of Potmesil & Chakravarty 1981. Our own: the exact
