@@ -10,23 +10,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
 
 _BITS = 32
-_CHUNK = 4096
+_CHUNK = 2048
 
 
-def replace(
+def fold(
     where: Bool[Array, " pixel"],
-    value: Float[Array, " pixel"],
+    start: Any,
     fetch: Callable[[Int[Array, " chunk"]], Any],
-    compute: Callable[[Any], Float[Array, " chunk"]],
-) -> Float[Array, " pixel"]:
-    """`value`, with `compute(fetch(pixels))` in the pixels `where`, chunk by chunk.
+    step: Callable[[Any, Int[Array, " chunk"], Any], Any],
+) -> Any:
+    """`start` after `step(carry, pixels, fetch(pixels))` for chunk by chunk of what is `where`.
 
+    In the last chunk pixels past the end stand for none; they are fetched as the last one.
     What `fetch` gives is carried from step to step, which lays it out in memory: else XLA
-    would fetch it anew for each tap of `compute`.
+    would fetch it anew for each tap of a filter.
     """
     words = _pack(where)
     ends = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
@@ -37,14 +38,13 @@ def replace(
         pixels = jnp.where(rank < ends[-1], _nth_set(words, ends, rank), where.size)
         return pixels, fetch(jnp.minimum(pixels, where.size - 1))
 
-    def step(k, carry):
+    def body(k, carry):
         (pixels, fetched), result = carry
-        new = compute(fetched)
-        result = result.at[pixels].set(new, mode="drop", unique_indices=True)
+        result = step(result, pixels, fetched)
         return load(k + 1), result
 
     steps = (ends[-1] + chunk - 1) // chunk
-    return jax.lax.fori_loop(0, steps, step, (load(0), value))[1]
+    return jax.lax.fori_loop(0, steps, body, (load(0), start))[1]
 
 
 def _pack(bits: Bool[Array, " pixel"]) -> UInt32[Array, " word"]:

@@ -37,30 +37,18 @@ class Places(NamedTuple):
     dy: Float[Array, "*place"]
 
 
-def check_size(function: str, size: Any) -> int:
-    if isinstance(size, bool) or not isinstance(size, int) or size < 1 or size % 2 == 0:
-        raise ValueError(
-            f"`{function}(size=...)` must be an odd number of texels from 1, got {size!r}."
-        )
-    return size
-
-
-def check_kernel(function: str, kernel: str) -> None:
-    if kernel not in get_args(Kernel):
-        raise ValueError(
-            f"`{function}(kernel=...)` must be one of {get_args(Kernel)}, got {kernel!r}."
-        )
-
-
-def check_softness(function: str, softness: Any) -> Array | None:
-    if softness is None:
-        return None
-    softness = parameter(f"{function}(softness=...)", softness)
-    check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
-    return softness
-
-
-def check_data(function: str, shadow_map: Any, receivers: Any) -> tuple[Array, Receivers]:
+def checked(
+    function: str,
+    shadow_map: Any,
+    receivers: Any,
+    bias: Any,
+    slope_bias: Any,
+    softness: Any = None,
+    *,
+    size: Any = 1,
+    kernel: Any = "box",
+) -> tuple[Any, ...]:
+    """The five arguments that the filters share, as arrays; `ValueError` names a wrong one."""
     shadow_map = jnp.asarray(shadow_map)
     if shadow_map.ndim != 2 or 0 in shadow_map.shape:
         raise ValueError(
@@ -77,18 +65,25 @@ def check_data(function: str, shadow_map: Any, receivers: Any) -> tuple[Array, R
     for name, field in (("shadow_map", shadow_map), ("receivers", fields[0])):
         if not jnp.issubdtype(field.dtype, jnp.floating):
             raise ValueError(f"`{function}({name})` must hold floats, got {field.dtype}.")
-    return shadow_map, Receivers(*fields)
-
-
-def check_bias(function: str, bias: Any, slope_bias: Any) -> tuple[Array, Array]:
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1 or size % 2 == 0:
+        raise ValueError(
+            f"`{function}(size=...)` must be an odd number of texels from 1, got {size!r}."
+        )
+    if kernel not in get_args(Kernel):
+        raise ValueError(
+            f"`{function}(kernel=...)` must be one of {get_args(Kernel)}, got {kernel!r}."
+        )
     bias = parameter(f"{function}(bias=...)", bias)
     slope_bias = parameter(f"{function}(slope_bias=...)", slope_bias)
-    return bias, slope_bias
+    if softness is not None:
+        softness = parameter(f"{function}(softness=...)", softness)
+        check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
+    return shadow_map, Receivers(*fields), bias, slope_bias, softness
 
 
-def without_gradient(softness: Any, kernel: Kernel, data: Any) -> Any:
-    """The data of a filter, constant where its result is a step of them."""
-    is_step = softness is None and kernel == "box"
+def without_gradient(kernel: Kernel, data: tuple[Any, ...]) -> Any:
+    """What `checked` gave, constant where the filter is a step of it."""
+    is_step = data[-1] is None and kernel == "box"
     return jax.lax.stop_gradient(data) if is_step else data
 
 
@@ -119,16 +114,18 @@ def find_places(
     """The receivers in a map of `shape` that `pad_map` padded for filters of `size`."""
     u, v, z, slope = (field.astype(dtype) for field in receivers)
     threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
-    known = jnp.isfinite(u) & jnp.isfinite(v) & jnp.isfinite(threshold) & (z > 0)
-    u, v = jnp.where(known, u, -size), jnp.where(known, v, -size)
-    threshold = jnp.where(known, threshold, 0)
+    threshold = jnp.where((z > 0) & (threshold < jnp.inf), threshold, -jnp.inf)
 
-    x, y = (jax.lax.stop_gradient(jnp.floor(each)) for each in (u, v))
+    # A NaN is on neither side of anything, and goes outside of the map.
     reach = size // 2
-    column, row = (
-        (jnp.clip(each, -reach - 1, count + reach) + size).astype(jnp.int32)
-        for each, count in ((x, shape[1]), (y, shape[0]))
+    u, v = (
+        jnp.where(
+            each > -reach - 1, jnp.where(each < count + reach, each, count + reach), -reach - 1
+        )
+        for each, count in ((u, shape[1]), (v, shape[0]))
     )
+    x, y = (jax.lax.stop_gradient(jnp.floor(each)) for each in (u, v))
+    column, row = (each.astype(jnp.int32) + size for each in (x, y))
     return Places(row, column, threshold, u - x - 0.5, v - y - 0.5)
 
 

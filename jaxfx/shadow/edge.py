@@ -6,16 +6,13 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import sequential_vmap
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxfx._numerics import is_concrete
 from jaxfx.shadow import _taps
-from jaxfx.shadow._compact import replace
-from jaxfx.shadow._taps import Kernel, Places
-from jaxfx.shadow._windows import extremes
-from jaxfx.shadow.pcf import average, filtered
+from jaxfx.shadow._masked import find_mask, masked
+from jaxfx.shadow._taps import Kernel
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -78,11 +75,10 @@ def edge_pcf(
     earlier, Uralsky 2005 (GPU Gems 2, chapter 17) and Evans et al. filter edges alone. Our
     own: the mask by depth, the compaction, the derivatives.
     """
-    data = _checked("edge_pcf", shadow_map, receivers, size, bias, slope_bias, mask, dilation)
-    _taps.check_kernel("edge_pcf", kernel)
-    softness = _taps.check_softness("edge_pcf", softness)
-    dilation, data = data[0], _taps.without_gradient(softness, kernel, data[1:])
-    return _edge_pcf(size, kernel, mask, dilation, *data, softness)
+    data = (shadow_map, receivers, bias, slope_bias, softness)
+    data = _taps.checked("edge_pcf", *data, size=size, kernel=kernel)
+    dilation = _reach("edge_pcf", mask, dilation, size, data)
+    return _edge_pcf(size, kernel, mask, dilation, *_taps.without_gradient(kernel, data))
 
 
 def candidates(
@@ -110,35 +106,30 @@ def candidates(
 
     Source: as `edge_pcf`'s.
     """
-    data = _checked("candidates", shadow_map, receivers, size, bias, slope_bias, mask, dilation)
-    softness = _taps.check_softness("candidates", softness)
-    dilation, *data = data
-    where = _candidates(size, mask, dilation, *data, softness)
+    data = (shadow_map, receivers, bias, slope_bias, softness)
+    data = _taps.checked("candidates", *data, size=size)
+    where = _candidates(size, mask, _reach("candidates", mask, dilation, size, data), *data)
     tests = where.size * (2 if mask == "depth" else 1)
     taps = jnp.sum(where, dtype=jnp.uint32) * size**2
     return Candidates(where, tests + taps)
 
 
-def _checked(name, shadow_map, receivers, size, bias, slope_bias, mask, dilation):
-    """The dilation, and the arrays as arrays."""
-    shadow_map, receivers = _taps.check_data(name, shadow_map, receivers)
-    size = _taps.check_size(name, size)
-    biases = _taps.check_bias(name, bias, slope_bias)
+def _reach(name: str, mask: Any, dilation: Any, size: int, data: tuple[Any, ...]) -> int:
+    """The dilation, checked; found if it is left out; 0 where there is none."""
     if mask not in get_args(Mask):
         raise ValueError(f"`{name}(mask=...)` must be one of {get_args(Mask)}, got {mask!r}.")
-    data = (shadow_map, receivers, *biases)
     if mask == "depth":
-        return 0, *data
+        return 0
     if dilation is None:
         if not is_concrete(data):
             raise ValueError(
                 f"`{name}(dilation=...)` must be given under `jit`, `grad` and `vmap`, where "
                 "it can't be taken from the receivers: static, in pixels, got None."
             )
-        dilation = enough_dilation(*data, size)
+        dilation = enough_dilation(*data[:4], size)
     if isinstance(dilation, bool) or not isinstance(dilation, int) or dilation < 1:
         raise ValueError(f"`{name}(dilation=...)` must be 1 or more pixels, got {dilation!r}.")
-    return dilation, *data
+    return dilation
 
 
 def enough_dilation(shadow_map, receivers: Receivers, bias, slope_bias, size: int) -> int:
@@ -164,72 +155,9 @@ def enough_dilation(shadow_map, receivers: Receivers, bias, slope_bias, size: in
     return int(min(np.ceil(pixels) + 1, max(u.shape)))
 
 
-def _screen_mask(
-    hard: Float[Array, "height width"], dilation: int
-) -> Bool[Array, "height width"]:
-    smallest, largest = extremes(hard, 2 * dilation + 1)
-    return smallest != largest
-
-
-def _prepare(size, mask, dilation, shadow_map, receivers, bias, slope_bias, softness):
-    """The padded map, the places, the mask, and what the pixels outside of it are."""
-    dtype = _taps.common_dtype(shadow_map, receivers)
-    texels = _taps.pad_map(shadow_map, size, dtype)
-    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
-    if mask == "screen":
-        hard = average(texels, places, None, 1, "box")
-        return texels, _screen_mask(hard, dilation), hard
-    index = places.row * texels.shape[1] + places.column
-    smallest, largest = (
-        each.reshape(-1).at[index].get(mode="promise_in_bounds")
-        for each in extremes(texels, size)
-    )
-    if softness is None:
-        all_lit, any_lit = smallest >= places.threshold, largest >= places.threshold
-    else:
-        half = _taps.half_width(softness, dtype)
-        all_lit = smallest - places.threshold >= half
-        any_lit = largest - places.threshold > -half
-    value = (all_lit.astype(dtype) + any_lit.astype(dtype)) / 2
-    return texels, value == 0.5, value
-
-
 @ft.partial(jax.jit, static_argnums=(0, 1, 2))
 def _candidates(size, mask, dilation, *data):
-    return _prepare(size, mask, dilation, *jax.lax.stop_gradient(data))[1]
+    return find_mask(size, mask, dilation, *jax.lax.stop_gradient(data))[1]
 
 
-@ft.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
-def _masked(size, kernel, mask, dilation, shadow_map, receivers, bias, slope_bias, softness):
-    # A loop that ends with its data would go on to the slowest of a batch.
-    @sequential_vmap
-    def run(shadow_map, receivers, bias, slope_bias, softness):
-        data = (shadow_map, receivers, bias, slope_bias, softness)
-        texels, where, value = _prepare(size, mask, dilation, *data)
-        flat = Receivers(*(each.reshape(-1) for each in receivers))
-
-        def fetch(pixels):
-            chunk = Receivers(*(each[pixels] for each in flat))
-            return _taps.find_places(
-                chunk, bias, slope_bias, shadow_map.shape, size, texels.dtype
-            )
-
-        def compute(chunk: Any):
-            return average(texels, chunk, softness, size, kernel)
-
-        result = replace(where.reshape(-1), value.reshape(-1), fetch, compute)
-        return result.reshape(where.shape).astype(receivers.z.dtype)
-
-    return run(shadow_map, receivers, bias, slope_bias, softness)
-
-
-@_masked.defjvp
-def _masked_jvp(size, kernel, mask, dilation, primals, tangents):
-    value = _masked(size, kernel, mask, dilation, *primals)
-    where = _candidates(size, mask, dilation, *primals)
-    full = ft.partial(filtered, size=size, kernel=kernel)
-    _, tangent = jax.jvp(full, primals, tangents)
-    return value, jnp.where(where, tangent, 0)
-
-
-_edge_pcf = jax.jit(_masked, static_argnums=(0, 1, 2, 3))
+_edge_pcf = jax.jit(masked, static_argnums=(0, 1, 2, 3))

@@ -49,9 +49,8 @@ def hard(
 
     Source: Williams 1978, section 3.
     """
-    shadow_map, receivers = _taps.check_data("hard", shadow_map, receivers)
-    biases = _taps.check_bias("hard", bias, slope_bias)
-    return jax.lax.stop_gradient(filtered(shadow_map, receivers, *biases, None, 1, "box"))
+    data = _taps.checked("hard", shadow_map, receivers, bias, slope_bias)
+    return jax.lax.stop_gradient(filtered(*data, 1, "box"))
 
 
 def prefiltered(
@@ -81,10 +80,8 @@ def prefiltered(
 
     Source: the order of filtering that Reeves, Salesin & Cook 1987, section 3, warn of.
     """
-    shadow_map, receivers = _taps.check_data("prefiltered", shadow_map, receivers)
-    size = _taps.check_size("prefiltered", size)
-    biases = _taps.check_bias("prefiltered", bias, slope_bias)
-    return jax.lax.stop_gradient(_prefiltered(shadow_map, receivers, *biases, size))
+    data = _taps.checked("prefiltered", shadow_map, receivers, bias, slope_bias, size=size)
+    return jax.lax.stop_gradient(_prefiltered(*data[:4], size))
 
 
 @ft.partial(jax.jit, static_argnames=("size",))
@@ -139,13 +136,9 @@ def pcf(
     Source: Reeves, Salesin & Cook 1987, section 3; our own: the smooth comparison and the
     weights that follow the receiver.
     """
-    shadow_map, receivers = _taps.check_data("pcf", shadow_map, receivers)
-    size = _taps.check_size("pcf", size)
-    _taps.check_kernel("pcf", kernel)
-    softness = _taps.check_softness("pcf", softness)
-    biases = _taps.check_bias("pcf", bias, slope_bias)
-    data = _taps.without_gradient(softness, kernel, (shadow_map, receivers, *biases))
-    return filtered(*data, softness, size, kernel)
+    data = (shadow_map, receivers, bias, slope_bias, softness)
+    data = _taps.checked("pcf", *data, size=size, kernel=kernel)
+    return filtered(*_taps.without_gradient(kernel, data), size, kernel)
 
 
 @ft.partial(jax.jit, static_argnames=("size", "kernel"))
@@ -188,7 +181,8 @@ def average(
         return weight * weighted, weight
 
     total, down = _taps.sum_rows(row, size)
-    return total / (down * sum(across))
+    share = total / (down * sum(across))
+    return jnp.where(share > 1, 1, share)  # by rounding
 
 
 def read(texels: Texels, places: Places, dx: int, dy: Any) -> Float[Array, "*place"]:

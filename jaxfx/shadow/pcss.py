@@ -54,13 +54,11 @@ def pcss(
     Source: Fernando 2005, percentage-closer soft shadows; the box that follows the receiver
     is our own.
     """
-    shadow_map, receivers = _taps.check_data("pcss", shadow_map, receivers)
-    size = _taps.check_size("pcss", size)
-    softness = _taps.check_softness("pcss", softness)
-    biases = _taps.check_bias("pcss", bias, slope_bias)
+    data = (shadow_map, receivers, bias, slope_bias, softness)
+    shadow_map, receivers, *rest = _taps.checked("pcss", *data, size=size)
     light_size = parameter("pcss(light_size=...)", light_size)
     check("pcss(light_size=...)", light_size, lambda v: v > 0, "positive")
-    return _pcss(shadow_map, receivers, light_camera, *biases, softness, light_size, size)
+    return _pcss(shadow_map, receivers, light_camera, *rest, light_size, size)
 
 
 @ft.partial(jax.jit, static_argnames=("size",))

@@ -46,7 +46,9 @@ class Receivers(NamedTuple):
 def receivers(
     depth: Float[ArrayLike, "height width"],
     camera: PinholeCamera | OrthographicCamera,
-    light_camera: PinholeCamera | OrthographicCamera | Sequence[PinholeCamera],
+    light_camera: PinholeCamera
+    | OrthographicCamera
+    | Sequence[PinholeCamera | OrthographicCamera],
     *,
     normal: Float[ArrayLike, "height width 3"] | None = None,
     normal_offset: Float[ArrayLike, ""] | float = 0.0,
@@ -57,9 +59,10 @@ def receivers(
 
     - `depth`: height width, scene units along the optical axis, inf for background.
     - `camera`: the camera that sees `depth`.
-    - `light_camera`: the camera at the light that the shadow map is made with; or several, of
-      which each point takes the one that it lies deepest before, as on a cube about a point
-      light. Their maps then stand side by side, each as wide as twice its principal point's x.
+    - `light_camera`: the camera at the light that the shadow map is made with, also in a
+      sequence of one; or several pinholes, of which each point takes the one that it lies
+      deepest before, as on a cube about a point light. Their maps then stand side by side, each
+      as wide as twice its principal point's x. What `light_cameras` gives will do.
     - `normal`: height width 3, unit, world space; without it, that of the surface through the
       neighbouring pixels, on the nearer side in depth.
     - `normal_offset`: scene units; points are moved so far along their normals first, which
@@ -68,7 +71,7 @@ def receivers(
     **Returns:** `Receivers`, in the type of `depth`. A pixel that shows nothing, or that does
     not lie before the light, has -1 for `u`, `v` and `z`: it is lit.
 
-    **Raises:** `ValueError` for a wrong shape or no camera.
+    **Raises:** `ValueError` for a wrong shape, no camera, or an orthographic one of several.
 
     **Gradient:** exact with respect to `depth`, `normal`, `normal_offset` and every field of
     the cameras. Which neighbour tells the normal and which camera is taken do not move.
@@ -87,6 +90,11 @@ def receivers(
     cameras = (light_camera,) if isinstance(light_camera, _Camera) else tuple(light_camera)
     if not cameras:
         raise ValueError("`receivers(light_camera)` must be at least one camera, got none.")
+    if len(cameras) > 1 and not all(isinstance(each, PinholeCamera) for each in cameras):
+        kinds = ", ".join(type(each).__name__ for each in cameras)
+        raise ValueError(
+            f"`receivers(light_camera)` must be one camera or several pinholes, got {kinds}."
+        )
     if normal is not None:
         normal = parameter("receivers(normal=...)", normal, (*depth.shape, 3))
     offset = parameter("receivers(normal_offset=...)", normal_offset)

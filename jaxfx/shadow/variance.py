@@ -48,12 +48,10 @@ def variance(
 
     Source: Donnelly & Lauritzen 2006, variance shadow maps, equations 4 and 5.
     """
-    shadow_map, receivers = _taps.check_data("variance", shadow_map, receivers)
-    size = _taps.check_size("variance", size)
-    biases = _taps.check_bias("variance", bias, slope_bias)
+    data = _taps.checked("variance", shadow_map, receivers, bias, slope_bias, size=size)
     least = parameter("variance(min_variance=...)", min_variance)
     check("variance(min_variance=...)", least, lambda v: v >= 0, "0 or positive")
-    return _variance(shadow_map, receivers, *biases, least, size)
+    return _variance(*data[:4], least, size)
 
 
 @ft.partial(jax.jit, static_argnames=("size",))

@@ -55,6 +55,13 @@ def test_receivers_are_the_points_in_the_lights_space(light):
 
 
 @pytest.mark.parametrize("light", [sun_camera(), spot_camera()])
+def test_a_sequence_of_one_camera_is_that_camera(light):
+    data = np.full((HEIGHT, WIDTH), 3.0), eye_camera()
+    one, same = (shadow.receivers(*data, each) for each in (light, (light,)))
+    assert all(np.array_equal(a, b) for a, b in zip(one, same, strict=True))
+
+
+@pytest.mark.parametrize("light", [sun_camera(), spot_camera()])
 @pytest.mark.parametrize("is_given", [False, True])
 def test_the_slope_is_the_change_of_depth_from_texel_to_texel(light, is_given):
     camera, normal = eye_camera(), np.array([0.2, -1.0, 0.1])
@@ -145,6 +152,7 @@ def test_faults_name_their_argument():
         ("depth", (np.ones(3), camera, camera), {}),
         ("depth", (np.ones((2, 2), int), camera, camera), {}),
         ("light_camera", (depth, camera, ()), {}),
+        ("light_camera", (depth, camera, (camera, sun_camera())), {}),
         ("normal=...", (depth, camera, camera), {"normal": depth}),
         ("normal_offset=...", (depth, camera, camera), {"normal_offset": depth}),
     ]
