@@ -21,6 +21,10 @@ _TEXEL = LARGEST - 1
 HIT, MISS = 15, 14  # as levels
 # Below so many rays their bookkeeping costs more than the steps that it saves.
 _FEW = 4096
+# One of so many rays goes on when the others are done.
+_GOES_ON = 3
+# How many cells of its first level a ray crosses, at most, on its way through all the depth.
+_CELLS = 4
 
 
 def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> UInt32[Array, "..."]:
@@ -107,7 +111,10 @@ def walk(
     x, y = (jnp.where(begin.inside, cell, none) for cell in (begin.x, begin.y))
     state = pack(x, y, jnp.where(begin.inside, top, MISS), left, up)
     limit = np.iinfo(np.int32).max if max_steps is None else max_steps
-    state, steps = _walk(pyramid, r, state, none, limit)
+    # One step to the nearest depth of all, then on at the size of the way that is left.
+    state = _sunk(depth, r, step(pyramid, r, state))
+    steps = begin.inside.astype(jnp.int32)
+    state, steps = _walk(pyramid, r, state, steps, limit)
 
     x, y, level, _, _ = unpack(state)
     when_x, when_y = _grid.came(r, x, y, left, up)
@@ -127,12 +134,28 @@ def walk(
     )
 
 
-def _walk(pyramid, r, state, steps, max_steps):
-    """All rays step until half of them are done; then the others go on by themselves.
+def _sunk(depth: Array, r: Rays, state: UInt32[Array, " ray"]) -> UInt32[Array, " ray"]:
+    """The state at the level whose cells suit the way through all the depth.
 
-    So all the work is at most twice the number of steps that the rays take together.
+    Any level gives the same hit: it is a matter of steps, of which the root's would be many.
     """
-    few = 0 if len(state) <= _FEW else -(-len(state) // 2)
+    x, y, level, left, up = unpack(state)
+    finite = depth < jnp.inf
+    nearest = jnp.min(jnp.where(finite, depth, jnp.inf))
+    farthest = jnp.max(jnp.where(finite, depth, -jnp.inf))
+    way = (farthest - nearest) * r.iz * jnp.maximum(jnp.abs(r.dx), jnp.abs(r.dy))
+    fit = jnp.ceil(jnp.log2(jnp.maximum(way / _CELLS, 1)))
+    sinks = (level < MISS) & (r.iz > 0) & (fit < level.astype(fit.dtype))
+    level = jnp.where(sinks, jnp.where(sinks, fit, 0).astype(level.dtype), level)
+    return pack(x, y, level, left, up)
+
+
+def _walk(pyramid, r, state, steps, max_steps):
+    """All rays step until two thirds of them are done; then the others go on by themselves.
+
+    So all the work is at most three times the number of steps that the rays take together.
+    """
+    few = 0 if len(state) <= _FEW else -(-len(state) // _GOES_ON)
 
     def alive(state, steps):
         return (level_of(state) < MISS) & (steps < max_steps)
