@@ -2,8 +2,7 @@
 
 import functools as ft
 import math
-from collections.abc import Callable
-from typing import Literal, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +12,22 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._linear import linear
+from jaxfx._filter import (
+    Sampling,
+    added,
+    apart,
+    discrete_terms,
+    filter_tangent,
+    linear_reads,
+    separable,
+)
 from jaxfx._numerics import check, check_image, parameter, working_dtype
 
 
 __all__ = ["binomial_weights", "downsample", "gaussian", "linear_taps"]
 
-Sampling = Literal["discrete", "linear"]
-
 # A variance below this, in pixels squared, is this: no neighbour's weight exceeds e**-500.
 _SMALLEST_VARIANCE = 1e-3
-# So many pairs of taps are read at once.
-_GROUP = 8
 
 
 def gaussian(
@@ -41,8 +44,7 @@ def gaussian(
     A pixel becomes the mean of its neighbours, weighted by w_i w_j at an offset of (i, j)
     pixels; beyond the border the nearest pixel is repeated. The weights are binomial ones, or
     those of `exp(-i**2 / (2 sigma**2))`, and sum to 1. Variances add: n passes of k taps reach
-    as far as one of n (k - 1) + 1 taps, for n k reads along each axis. On a CPU, several passes
-    are quicker than one of more than 15 taps.
+    as far as one of n (k - 1) + 1 taps, for n k reads along each axis.
 
     **Arguments:**
 
@@ -153,7 +155,7 @@ def linear_taps(
             f"got {array.dtype} of shape {array.shape}."
         )
     check("linear_taps(weights)", array, lambda v: v >= 0, "0 or positive")
-    reads = _reads(array)
+    reads = linear_reads(array)
     middle = (array.size - 1) / 2
     offsets = jnp.stack([first - middle + share for first, share, _ in reads])
     return offsets, jnp.stack([weight for _, _, weight in reads])
@@ -213,88 +215,9 @@ def _gaussian_weights(taps: int, sigma: Float[Array, ""], passes: int) -> Float[
     return weights / jnp.sum(weights)
 
 
-def _reads(weights: Float[Array, "taps"]) -> list[tuple[int, Array, Array]]:
-    """What linear sampling reads: the first tap, the second's share, and the weight of both.
-
-    The first tap is static. A read of one tap alone has a share of 0.
-    """
-    taps = weights.size
-    half = taps // 2
-    lone = (taps + half) % 2  # whether the middle is a read of its own
-    right = [(i, i + 1) for i in range(half + lone, taps, 2)]
-    left = [(taps - 1 - j, taps - 1 - i) for i, j in reversed(right)]
-    if taps % 2 and not lone:
-        weights = weights.at[half].divide(2)
-    # Below this a share changes no sum, and its derivatives would overflow.
-    least = jnp.finfo(weights.dtype).tiny ** 0.25
-    reads = []
-    for i, j in left + [(taps - 1 - half, half)] * lone + right:
-        if i == j:
-            reads.append((i, jnp.zeros_like(weights[i]), weights[i]))
-        else:
-            total = weights[i] + weights[j]
-            is_seen = total > least
-            share = jnp.where(is_seen, weights[j] / jnp.where(is_seen, total, 1), 0)
-            reads.append((i, share, total))
-    return reads
-
-
-# A pass is a sum over taps, the arrays that `tap(i)` gives; they differ in their offset only.
-Tap = Callable[[int], Array]
-
-
-def _discrete(weights: Float[Array, "taps"], tap: Tap) -> list[Callable[[], Array]]:
-    """The terms of the weighted sum: two taps that share a weight are added first."""
-    last = weights.size - 1
-    pairs = [
-        lambda i=i: weights[i] * (tap(i) + tap(last - i)) for i in range(weights.size // 2)
-    ]
-    middle = [lambda: weights[last // 2] * tap(last // 2)] if weights.size % 2 else []
-    return middle + pairs
-
-
-def _linear(weights: Float[Array, "taps"], tap: Tap) -> list[Callable[[], Array]]:
-    """The terms of the same sum by half as many reads, each between two taps."""
-
-    def read(i: int, share: Array, is_lone: bool) -> Array:
-        return tap(i) if is_lone else tap(i) + share * (tap(i + 1) - tap(i))
-
-    middle = weights.size // 2 if weights.size % 4 == 1 else -1
-    return [
-        lambda i=i, share=share, weight=weight: weight * read(i, share, i == middle)
-        for i, share, weight in _reads(weights)
-    ]
-
-
-_TERMS = {"discrete": _discrete, "linear": _linear}
-
-
-def _added(terms: list[Callable[[], Array]]) -> Array:
-    return ft.reduce(jnp.add, [term() for term in terms])
-
-
-def _added_in_groups(terms: list[Callable[[], Array]]) -> Array:
-    """The same sum, some terms at a time.
-
-    XLA takes what more than 16 slices of one array read through memory, slice by slice; the
-    branches of a switch it leaves apart.
-    """
-    groups = [terms[i : i + _GROUP] for i in range(0, len(terms), _GROUP)]
-    if len(groups) == 1:
-        return _added(terms)
-    branches = [lambda total, group=group: total + _added(group) for group in groups]
-    shape = jax.eval_shape(terms[0])
-    return lax.fori_loop(
-        0,
-        len(groups),
-        lambda i, total: lax.switch(i, branches, total),
-        jnp.zeros(shape.shape, shape.dtype),
-    )
-
-
 @ft.partial(jax.jit, static_argnames=("passes", "sampling"))
 def _binomial_blur(image, weights, passes, sampling):
-    return _repeated(lambda image: _filter(sampling, image, weights, weights), image, passes)
+    return _repeated(lambda image: separable(sampling, image, weights, weights), image, passes)
 
 
 @ft.partial(jax.jit, static_argnames=("taps", "passes", "sampling"))
@@ -319,7 +242,7 @@ def _gaussian_pass(
 ) -> Float[Array, "h w c"]:
     """One of several passes that together have the standard deviation `sigma`."""
     weights = _gaussian_weights(taps, sigma, passes).astype(image.dtype)
-    return _filter(sampling, image, weights, weights)
+    return separable(sampling, image, weights, weights)
 
 
 @ft.partial(_gaussian_pass.defjvp, symbolic_zeros=True)
@@ -329,152 +252,13 @@ def _(sampling, taps, passes, primals, tangents):
     out = _gaussian_pass(sampling, taps, passes, image, sigma)
     weights_of = lambda sigma: _gaussian_weights(taps, sigma, passes).astype(image.dtype)
     weights, slopes = jax.jvp(weights_of, (sigma,), (jnp.ones_like(sigma),))
-    dot = _filter_tangent(image_dot, weights, weights)
+    dot = filter_tangent(image_dot, weights, weights)
     if not isinstance(sigma_dot, SymbolicZero):
-        # One after the other: two filters that read one image side by side are slow.
-        both = jnp.stack([weights, slopes])
-        along = lax.fori_loop(
-            0,
-            2,
-            lambda i, along: along + _filter("discrete", image, both[i], both[1 - i]),
-            jnp.zeros_like(image),
-        )
-        dot = dot + sigma_dot.astype(image.dtype) * along
+        # Apart, or XLA would gather the rows once for all filters and keep all of those copies.
+        for way in ((slopes, weights), (weights, slopes)):
+            along = apart(image, lambda way=way: separable("discrete", image, *way))
+            dot = dot + sigma_dot.astype(image.dtype) * along
     return out, dot
-
-
-@ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _filter(
-    sampling: Sampling,
-    image: Float[Array, "h w c"],
-    down: Float[Array, "taps"],
-    across: Float[Array, "taps"],
-) -> Float[Array, "h w c"]:
-    """Down the columns, then along the rows, by symmetric weights."""
-    down, across = down.astype(image.dtype), across.astype(image.dtype)
-    if down.size == 1 or image.shape[1] < down.size:
-        return _padded(sampling, image, down, across)
-    return _unpadded(sampling, image, down, across)
-
-
-@ft.partial(_filter.defjvp, symbolic_zeros=True)
-def _(sampling, primals, tangents):
-    (image, *weights), (image_dot, *weights_dot) = primals, tangents
-    dot = _filter_tangent(image_dot, *weights)
-    if any(not isinstance(each, SymbolicZero) for each in weights_dot):
-        # Asked for by second derivatives in `sigma` alone.
-        weights_dot = [
-            jnp.zeros(each.shape, each.dtype) if isinstance(each, SymbolicZero) else each
-            for each in weights_dot
-        ]
-        by_weights = ft.partial(_padded, "discrete", image)
-        dot = dot + jax.jvp(by_weights, tuple(weights), tuple(weights_dot))[1]
-    return _filter(sampling, *primals), dot
-
-
-def _filter_tangent(
-    dot: Float[Array, "h w c"] | SymbolicZero, *weights: Float[Array, "taps"]
-) -> Float[Array, "h w c"]:
-    """The filter of an image's tangent, to be transposed as quickly as it is computed."""
-    if isinstance(dot, SymbolicZero):
-        return jnp.zeros(dot.shape, dot.dtype)
-    push = lambda x: _filter("discrete", x, *weights)
-    plain = lambda x: _padded("discrete", x, *weights)
-    if min(dot.shape[:2]) < weights[0].size:
-        return plain(dot)
-    return linear(push, lambda bar: _transposed(bar, *weights), plain, dot)
-
-
-def _transposed(
-    bar: Float[Array, "h w c"], *weights: Float[Array, "taps"]
-) -> Float[Array, "h w c"]:
-    """The transpose of `_filter`: itself, but what leaves the frame returns to its border."""
-    half = weights[0].size // 2
-    wide = jnp.pad(bar, ((half, half), (half, half), (0, 0)))
-    wide = _filter("discrete", wide, *weights)
-    for axis in (0, 1):
-        first, inside, last = jnp.split(wide, (half + 1, wide.shape[axis] - half - 1), axis)
-        ends = (jnp.sum(end, axis, keepdims=True) for end in (first, last))
-        wide = jnp.concatenate([next(ends), inside, next(ends)], axis)
-    return wide
-
-
-def _padded(
-    sampling: Sampling,
-    image: Float[Array, "h w c"],
-    down: Float[Array, "taps"],
-    across: Float[Array, "taps"],
-) -> Float[Array, "h w c"]:
-    """By copies with a margin: for small images, and for JAX to differentiate."""
-    height, width, channels = image.shape
-    half, terms = down.size // 2, _TERMS[sampling]
-    margin = ((half, half), (half, half), (0, 0))
-    wide = jnp.pad(image, margin, mode="edge").reshape(height + 2 * half, -1)
-    columns = _added(terms(down, lambda i: lax.slice_in_dim(wide, i, i + height)))
-    row = width * channels
-
-    def beside(i: int) -> Array:
-        return lax.slice_in_dim(columns, i * channels, i * channels + row, axis=1)
-
-    return _added(terms(across, beside)).reshape(image.shape)
-
-
-def _unpadded(
-    sampling: Sampling,
-    image: Float[Array, "h w c"],
-    down: Float[Array, "taps"],
-    across: Float[Array, "taps"],
-) -> Float[Array, "h w c"]:
-    """Without a copy of the image: it is read once and written once by each pass.
-
-    Along the rows, a tap is the flat image moved by some pixels, which runs on into the next
-    row at either border. There the result is computed apart, in two strips, and then put in.
-    """
-    height, width, channels = image.shape
-    half, terms = down.size // 2, _TERMS[sampling]
-    row, reach = width * channels, half * channels
-
-    columns = _columns(ft.partial(terms, down), image.reshape(height, row), half).reshape(-1)
-
-    def moved(i: int) -> Array:
-        start = row + (i - half) * channels
-        return lax.slice_in_dim(columns, start, start + height * row)
-
-    whole = _added_in_groups(terms(across, moved)).reshape(height, row)
-
-    edges = [jnp.repeat(image[:, i : i + 1], half, axis=1) for i in (0, width - 1)]
-    ends = [image[:, : 2 * half], image[:, width - 2 * half :]]
-    sides = jnp.concatenate([edges[0], *ends, edges[1]], axis=1).reshape(height, -1)
-    sides = _columns(ft.partial(terms, down), sides, half)
-
-    def beside(i: int) -> Array:
-        return lax.slice_in_dim(sides, i * channels, i * channels + 4 * reach, axis=1)
-
-    sides = _added_in_groups(terms(across, beside))
-
-    # In a loop: outside of one, XLA computes the whole again to put a strip into it.
-    def put(i: Array, whole: Array) -> Array:
-        strip = lax.dynamic_slice(sides, (1, i * (3 * reach)), (height, reach))
-        return lax.dynamic_update_slice(whole, strip, (0, i * (row - reach)))
-
-    return lax.fori_loop(0, 2, put, whole).reshape(image.shape)
-
-
-def _columns(
-    terms: Callable[[Tap], list[Callable[[], Array]]], flat: Float[Array, "h wc"], half: int
-) -> Float[Array, "h+2 wc"]:
-    """The pass down the columns, with a row of zeros above and one below.
-
-    Rows are named by their index, held within the image. XLA keeps in memory what is padded,
-    where it would compute a bare sum anew for every tap that reads it.
-    """
-    height = flat.shape[0]
-    indices = np.arange(height)[:, None] + np.arange(-half, half + 1)
-    indices = jnp.asarray(indices.clip(0, height - 1))
-    sums = _added_in_groups(
-        terms(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
-    )
-    return lax.pad(sums, jnp.zeros((), flat.dtype), ((1, 1, 0), (0, 0, 0)))
 
 
 @jax.jit
@@ -498,4 +282,4 @@ def _halved(
     def tap(i: int) -> Array:
         return lax.slice_in_dim(wide, i, i + length - 1, 2, axis)
 
-    return _added(_discrete(weights, tap))
+    return added(discrete_terms(weights, tap))

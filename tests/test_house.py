@@ -21,7 +21,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
-NUMERICS = {"_linear", "_numerics", "_tiles", "_pyramid", "_sampling"}
+NUMERICS = {"_filter", "_linear", "_numerics", "_tiles", "_pyramid", "_sampling"}
 TYPES = {"camera", "lens", "light", "gbuffer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"scene", "exr"}
@@ -42,7 +42,8 @@ LAZY_LIBRARIES = {"embreex", "matplotlib", "OpenEXR", "OpenGL", "PIL", "pyrender
 # What may be given by position, in the order in which it is given.
 DATA = (
     *("render", "taps", "weights"),
-    *("image", "images", "shadow_map", "gbuffer", "gbuffers", "depth", "depths"),
+    *("image", "images", "shadow_map", "gbuffer", "gbuffers"),
+    *("transfer", "depth", "depths"),
     *("camera", "cameras", "receivers", "lens", "source", "sources", "target"),
     *("origin", "direction", "light", "lights", "light_camera", "visibility", "coverage"),
 )

@@ -6,6 +6,7 @@ each of two passes, 50 MB in all; OpenCV keeps some rows in its cache and moves 
 """
 
 import os
+import time
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +70,27 @@ def test_one_pass_of_9_taps(benchmark, peer):
     if peer != "sigma":
         np.testing.assert_allclose(function(), expected, atol=1e-6)
     benchmark.pedantic(function, rounds=31, warmup_rounds=3)
+
+
+@pytest.mark.parametrize("peer", ["OpenCV", "SciPy"])
+def test_ratio(benchmark, peer):
+    """Ours and a peer's in turns, so that what else the machine does meets both alike.
+
+    The ratio of the medians, ours to theirs, is kept as `ratio` with the run.
+    """
+    benchmark.group = "ours, in turns with a peer"
+    theirs, times = PEERS[peer](), []
+
+    def their_turn():
+        start = time.perf_counter()
+        theirs()
+        times.append(time.perf_counter() - start)
+
+    rounds = {"OpenCV": 101, "SciPy": 9}[peer]
+    benchmark.pedantic(PEERS["discrete"](), setup=their_turn, rounds=rounds, warmup_rounds=3)
+    ratio = float(benchmark.stats.stats.median / np.median(times[3:]))
+    benchmark.extra_info["ratio"] = ratio
+    print(f"\n{ratio:.2f} of {peer}'s {1e3 * np.median(times[3:]):.2f} ms")
 
 
 @pytest.mark.parametrize("form", ["one of 33", "four of 9", "four of 9, bilinear reads"])
