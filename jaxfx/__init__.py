@@ -6,7 +6,7 @@ Types live here; effects live in their modules: `jaxfx.dof`. The host side, `jax
 """
 
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.gbuffer import GBuffer
+from jaxfx.gbuffer import GBuffer, Transfer
 from jaxfx.lens import FocusPlanes, ThinLens
 from jaxfx.light import AmbientLight, DirectionalLight, PointLight, SpotLight
 
@@ -21,4 +21,5 @@ __all__ = [
     "PointLight",
     "SpotLight",
     "ThinLens",
+    "Transfer",
 ]

@@ -107,6 +107,18 @@ def gbuffer(rng, size):
     )
 
 
+def transfer(rng, size):
+    """Five points in front of the pixels, and a matrix of rank 2."""
+    normal = rng.normal(size=(5, 3)) * 0.3 + [0, 0, -1]
+    return jaxfx.Transfer(
+        receive=rng.uniform(0.1, 1, (*size, 2)),
+        send=rng.uniform(0.1, 1, (2, 5)),
+        position=rng.uniform(1, 2, (5, 3)),
+        normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
+        diffuse=rng.uniform(0.1, 1, (5, 3)),
+    )
+
+
 def ray_origins(rng, size):
     return rng.uniform(0, 1, (*size, 3)) * np.array([size[1], size[0], 1.0])
 
@@ -120,6 +132,8 @@ EXAMPLES = {
     "visibility": [lambda rng, size: rng.uniform(0, 1, size)],
     "mask": [lambda rng, size: np.ones(size, bool)],
     "gbuffer": [gbuffer],
+    "transfer": [transfer],
+    "lit": [lambda rng, size: [None, rng.uniform(0, 1, 5)]],
     "shadow_map": [lambda rng, size: rng.uniform(1.1, 4, size)],
     "receivers": [receivers],
     "light_camera": [orthographic, pinhole],

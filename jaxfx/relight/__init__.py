@@ -1,6 +1,7 @@
 """Relighting: a deep frame buffer shaded again whenever a light changes."""
 
 from jaxfx.relight.holes import fill_holes
+from jaxfx.relight.indirect import indirect
 from jaxfx.relight.normals import capture_normals
 from jaxfx.relight.shading import render, shade
 from jaxfx.relight.state import RelightState, start
@@ -12,6 +13,7 @@ __all__ = [
     "best_caches",
     "capture_normals",
     "fill_holes",
+    "indirect",
     "render",
     "shade",
     "start",

@@ -8,6 +8,7 @@ from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Material, Scene, Viewpoint
 from jaxfx.scene._still_life import still_life
+from jaxfx.scene._transfer import transfer, visible
 from jaxfx.scene._view import default_camera, default_lights
 
 
@@ -24,4 +25,6 @@ __all__ = [
     "material_ids",
     "object_ids",
     "still_life",
+    "transfer",
+    "visible",
 ]

@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
@@ -23,6 +23,7 @@ def problem() -> str | None:
 
 
 _NUDGE = 1 / 512  # pixels; a rasteriser's own grid is some 1/256
+_INSET = 1e-4  # of the scene's scale, off the surfaces that a way begins and ends on
 _built: weakref.WeakKeyDictionary[Scene, Any] = weakref.WeakKeyDictionary()
 
 
@@ -50,6 +51,25 @@ def first_faces(
         np.ascontiguousarray(view.turn(directions).T, np.float32),
     )
     return faces
+
+
+def unobstructed(
+    scene: Scene,
+    start: Float[np.ndarray, "ray 3"],
+    end: Float[np.ndarray, "ray 3"],
+) -> Bool[np.ndarray, " ray"]:
+    """Whether nothing stands between the ends, which may lie on surfaces themselves."""
+    start, end = ((each - scene.centre) / scene.scale for each in (start, end))
+    way = end - start
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    inset = np.minimum(_INSET, length / 4) * way / np.where(length > 0, length, 1)
+    hits = _accelerated(scene).run(
+        np.ascontiguousarray(start + inset, np.float32),
+        np.ascontiguousarray(way - 2 * inset, np.float32),
+        dists=np.ones(len(way), np.float32),
+        query="OCCLUDED",
+    )
+    return hits < 0
 
 
 def _accelerated(scene: Scene) -> Any:

@@ -122,11 +122,26 @@ def _normals(scene: Scene, view: View, hits: Hits) -> Float[np.ndarray, "3 hit"]
     one = np.float32(1)
     flat = view.turn(hits.normal).astype(np.float32)
     toward = view.turn(_unit(hits.toward)).astype(np.float32)
+    normal = _fronts(scene, hits, flat) * np.where(hits.front, one, -one)
+    return _unit(normal - np.maximum(_dot(normal, toward), 0) * toward)
+
+
+def _fronts(
+    scene: Scene, hits: Hits, flat: Float[np.ndarray, "3 hit"]
+) -> Float[np.ndarray, "3 hit"]:
+    """Interpolated unit normals, on the front of faces with normals `flat`, bent by maps."""
+    one = np.float32(1)
     normal = _interpolate(scene.normals, hits.face, hits.weights)
     normal *= np.where(_dot(normal, flat) < 0, -one, one)
-    normal = _unit(np.where((normal == 0).all(axis=0), flat, normal))
-    normal = _bent(scene, hits, normal) * np.where(hits.front, one, -one)
-    return _unit(normal - np.maximum(_dot(normal, toward), 0) * toward)
+    return _bent(scene, hits, _unit(np.where((normal == 0).all(axis=0), flat, normal)))
+
+
+def at_hits(
+    scene: Scene, hits: Hits
+) -> tuple[Float[np.ndarray, "hit 3"], Float[np.ndarray, "hit 3"], Float[np.ndarray, " hit"]]:
+    """Normals on the faces' fronts, base colour and metallic; `hits.normal` in world space."""
+    color, metallic, _ = _materials(scene, hits)
+    return _fronts(scene, hits, hits.normal.astype(np.float32)).T, color, metallic
 
 
 def _bent(

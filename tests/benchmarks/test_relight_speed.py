@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import relight_scenes as scenes
 
-from jaxfx import PointLight, relight, scene
+from jaxfx import PointLight, relight
 
 
 SIZE = (480, 640)
@@ -109,18 +109,3 @@ def test_derivatives_in_the_edited_light(benchmark, mode):
         "grad": jax.jit(jax.grad(loss)),
     }[mode]
     run(benchmark, lambda: function(lights[0]))
-
-
-def test_what_is_rendered_anew_is_what_is_edited():
-    """The two pictures that are timed are of the same scene: alike but for shadows' edges."""
-    mesh, camera = scenes.view((48, 64))
-    lights = scenes.lights(3)
-    image = scenes.rendered_anew(mesh, camera, lights, (48, 64))
-    gbuffer = scene.gbuffer(mesh, camera, height=48, width=64, backend="embree")
-    start = scenes.shadow_starts(mesh, gbuffer, camera)
-    visible = [
-        jnp.asarray(scenes.unshadowed(mesh, start, light).reshape(48, 64), jnp.float32)
-        for light in lights
-    ]
-    state = relight.start(gbuffer, camera, lights, visibilities=visible)
-    np.testing.assert_allclose(state.image, image, rtol=1e-4, atol=1e-4)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import relight_scenes
 
 from jaxfx import (
     AmbientLight,
@@ -16,6 +17,7 @@ from jaxfx import (
     PointLight,
     SpotLight,
     relight,
+    scene,
 )
 
 
@@ -385,3 +387,16 @@ def test_errors_name_the_argument():
         paint(state, np.ones((2, 2), bool), color=NEW)
     with pytest.raises(ValueError, match=r"`paint\(color=...\)` must have shape \(3,\)"):
         paint(state, MASK, color=0.5)
+
+
+def test_what_is_rendered_anew_is_what_is_edited():
+    """The two pictures that the benchmark times are the same, shadows and all."""
+    mesh, camera = relight_scenes.view((24, 32))
+    lights = relight_scenes.lights(2)
+    image = relight_scenes.rendered_anew(mesh, camera, lights, (24, 32))
+    gbuffer = scene.gbuffer(mesh, camera, height=24, width=32, backend="embree")
+    visible = [relight_scenes.unshadowed(mesh, gbuffer, camera, light) for light in lights]
+    assert 0.05 < float(jnp.mean(jnp.stack(visible))) < 0.99
+    state = relight.start(gbuffer, camera, lights, visibilities=[None, visible[1]])
+    state = state.edit(0, lights[0], visible[0])
+    np.testing.assert_allclose(state.image, image, rtol=1e-4, atol=1e-5)

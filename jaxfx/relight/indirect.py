@@ -1,0 +1,108 @@
+"""Light that comes by way of another surface, for the cost of a matrix product."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import parameter, working_dtype
+from jaxfx.gbuffer import GBuffer, Transfer
+from jaxfx.light import AmbientLight, Light
+from jaxfx.relight.shading import Surface, checked, received
+
+
+def indirect(
+    gbuffer: GBuffer,
+    transfer: Transfer,
+    lights: Sequence[Light],
+    *,
+    lit: Sequence[Float[ArrayLike, " point"] | None] | None = None,
+) -> Float[Array, "height width 3"]:
+    """The picture of what diffuse surfaces send on to one another, once: add it to `render`'s.
+
+    With E the irradiance of the transfer's points under the lights,
+    `gbuffer.diffuse * receive @ (send @ (diffuse * E))`. It is linear in the lights: that of
+    an edited light alone is the change of the picture.
+
+    It does badly where a surface is nearly touched by another, for a point stands for a disc;
+    and knows no highlight, neither of the light that is sent nor of the surface that sends.
+
+    **Arguments:**
+
+    - `gbuffer`: the cache, height width.
+    - `transfer`: from `scene.transfer`, of this cache.
+    - `lights`: a sequence of lights of any kinds. Ambient ones stand for indirect light
+      themselves, and bring nothing here.
+    - `lit`: for each light, a number in [0, 1] for each point, how much of the light gets
+      there, or None for all of it. `scene.visible(mesh, transfer.position, light.position)`
+      tells. None alone stands for no shadows at all.
+
+    **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`; 0 where the
+    shader is -1.
+
+    **Raises:** `ValueError` for another size, an unknown light, or a `lit` that does not fit.
+
+    **Gradient:** exact with respect to `gbuffer.diffuse`, every field of `transfer`, the lights
+    and `lit`, as `shade`'s; zero with respect to the cache's other images.
+
+    Source: Hasan, Pellacini & Bala 2006, equation 3.
+    """
+    if not isinstance(lights, Sequence):
+        kind = type(lights).__name__
+        raise ValueError(f"`indirect(lights)` must be a sequence of lights, got {kind}.")
+    named = {f"indirect(lights[{index}])": light for index, light in enumerate(lights)}
+    gbuffer = checked(gbuffer, named)
+    shape = transfer.receive.shape[:2]
+    if shape != gbuffer.depth.shape:
+        raise ValueError(
+            f"`indirect(transfer)` must be of the cache's height and width "
+            f"{gbuffer.depth.shape}, got {shape}."
+        )
+    lit = [None] * len(lights) if lit is None else lit
+    if len(lit) != len(lights):
+        raise ValueError(
+            f"`indirect(lit=...)` must hold numbers or None for each of {len(lights)} lights, "
+            f"got {len(lit)}."
+        )
+    points = (len(transfer.position),)
+    lit = [
+        each if each is None else parameter(f"indirect(lit=...)[{i}]", each, points)
+        for i, each in enumerate(lit)
+    ]
+    return _indirect(gbuffer, transfer, tuple(lights), lit)
+
+
+@jax.jit
+def _indirect(gbuffer, transfer, lights, lit):
+    dtype = working_dtype(gbuffer.color.dtype)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
+    surface = _points(transfer)
+    arriving = jnp.zeros_like(transfer.diffuse)
+    for light, share in zip(lights, lit, strict=True):
+        if not isinstance(light, AmbientLight):
+            brought = received(surface, light)[0][0]
+            arriving += brought if share is None else share.astype(dtype)[:, None] * brought
+    sent = transfer.send @ (transfer.diffuse * arriving)
+    image = gbuffer.diffuse.astype(dtype) * (transfer.receive @ sent)
+    image = jnp.where((gbuffer.shader < 0)[..., None], 0, image)
+    return image.astype(gbuffer.color.dtype)
+
+
+def _points(transfer: Transfer) -> Surface:
+    """The points as a surface of one row, Lambert."""
+    position, normal, diffuse = (
+        field[None] for field in (transfer.position, transfer.normal, transfer.diffuse)
+    )
+    zero, plain = jnp.zeros_like(position), position[..., 0]
+    return Surface(
+        shader=jnp.zeros(plain.shape, jnp.int32),
+        position=position,
+        normal=normal,
+        to_camera=zero,
+        ambient=zero,
+        diffuse=diffuse,
+        specular=zero,
+        exponent=jnp.zeros_like(plain),
+    )

@@ -1,0 +1,108 @@
+"""Light by way of other surfaces, against a plain loop over points."""
+
+import inspect
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxfx import (
+    AmbientLight,
+    DirectionalLight,
+    GBuffer,
+    PointLight,
+    SpotLight,
+    Transfer,
+    relight,
+)
+
+
+RNG = np.random.default_rng(0)
+HEIGHT, WIDTH, RANK, POINTS = 3, 4, 2, 5
+SHADER = np.array([[0, 1, 2, -1]] * 3)
+IMAGE = RNG.uniform(0.1, 1, (HEIGHT, WIDTH, 3))
+CACHE = GBuffer(
+    **dict.fromkeys(("color", "ambient", "specular", "normal"), np.ones((HEIGHT, WIDTH, 3))),
+    diffuse=IMAGE,
+    shader=SHADER,
+    depth=np.ones((HEIGHT, WIDTH)),
+    roughness=np.ones((HEIGHT, WIDTH)),
+)
+NORMAL = RNG.normal(size=(POINTS, 3))
+TRANSFER = Transfer(
+    receive=RNG.uniform(size=(HEIGHT, WIDTH, RANK)),
+    send=RNG.normal(size=(RANK, POINTS)),
+    position=RNG.normal(size=(POINTS, 3)),
+    normal=NORMAL / np.linalg.norm(NORMAL, axis=1, keepdims=True),
+    diffuse=RNG.uniform(size=(POINTS, 3)),
+)
+SPOT = SpotLight([0, 0, 4.0], [0, 0, -1.0], [3, 2, 1.0], 1.0, 1.2)
+LIGHTS = [
+    AmbientLight([1, 1, 1.0]),
+    DirectionalLight([0.3, -1, 0.2], [1, 2, 3.0]),
+    PointLight([0.5, 2, -1.0], [2, 1, 4.0]),
+    SPOT,
+]
+LIT = [None, RNG.uniform(size=POINTS), None, RNG.uniform(size=POINTS)]
+
+
+def irradiance(light, place, normal):
+    """What a point gets of a light; all of the points lie inside the spot's inner cone."""
+    if isinstance(light, AmbientLight):
+        return np.zeros(3)
+    if isinstance(light, DirectionalLight):
+        way = -np.asarray(light.direction)
+        return np.asarray(light.color) * max(normal @ way / np.linalg.norm(way), 0)
+    way = np.asarray(light.position) - place
+    return np.asarray(light.color) * max(normal @ way, 0) / np.linalg.norm(way) ** 3
+
+
+def test_is_the_sum_over_points():
+    t, expected = TRANSFER, np.zeros((HEIGHT, WIDTH, 3))
+    for j in range(POINTS):
+        place, normal = np.asarray(t.position[j]), np.asarray(t.normal[j])
+        axis = (np.asarray(SPOT.position) - place) / np.linalg.norm(SPOT.position - place)
+        assert axis[2] > np.cos(1.0)
+        for light, lit in zip(LIGHTS, LIT, strict=True):
+            sent = np.asarray(t.diffuse[j]) * irradiance(light, place, normal)
+            share = np.asarray(t.receive) @ np.asarray(t.send[:, j])
+            expected += share[..., None] * sent * (1 if lit is None else lit[j])
+    expected *= IMAGE * (SHADER >= 0)[..., None]
+    assert np.abs(expected).max() > 0.1
+    result = relight.indirect(CACHE, t, LIGHTS, lit=LIT)
+    np.testing.assert_allclose(result, expected, rtol=1e-12)
+
+
+def test_no_lights_and_ambient_ones_bring_nothing():
+    for lights in ([], LIGHTS[:1]):
+        assert not np.asarray(relight.indirect(CACHE, TRANSFER, lights)).any()
+
+
+def test_a_bad_pixel_stays_where_it_is():
+    bad = eqx.tree_at(lambda g: g.diffuse, CACHE, CACHE.diffuse.at[1, 1].set(np.nan))
+    image = np.asarray(relight.indirect(bad, TRANSFER, LIGHTS, lit=LIT))
+    wrong = np.zeros((HEIGHT, WIDTH), bool)
+    wrong[1, 1] = True
+    np.testing.assert_array_equal(np.isnan(image).any(axis=-1), wrong)
+
+
+def test_errors_name_the_argument():
+    indirect = inspect.unwrap(relight.indirect)
+    small = Transfer(*(v[:2] if i == 0 else v for i, v in enumerate(vars(TRANSFER).values())))
+    for arguments, options, message in (
+        ((CACHE, small, LIGHTS), {}, r"`indirect\(transfer\)` must be of the cache's height"),
+        ((CACHE, TRANSFER, SPOT), {}, r"`indirect\(lights\)` must be a sequence of lights"),
+        ((CACHE, TRANSFER, [1]), {}, r"`indirect\(lights\[0\]\)` must be one of Ambient"),
+        ((CACHE, TRANSFER, LIGHTS), {"lit": [None]}, r"`indirect\(lit=...\)` must hold"),
+        ((CACHE, TRANSFER, [SPOT]), {"lit": [np.ones(3)]}, r"`indirect\(lit=...\)\[0\]` must"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            indirect(*arguments, **options)
+    fields = vars(TRANSFER)
+    for name, value, message in (
+        ("send", np.ones(3), r"`Transfer\(send\)` must have shape \(rank, point\), got \(3,\)"),
+        ("receive", np.ones((3, 4, 5)), r"`Transfer\(receive\)` must have shape \(height, wi"),
+        ("normal", np.ones((4, 3)), r"`Transfer\(normal\)` must have shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Transfer(**fields | {name: value})

@@ -1,0 +1,114 @@
+"""Light from surface to surface against closed forms: a ball, parallel squares, a wall."""
+
+import inspect
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from trimesh import Trimesh, creation, util
+
+from jaxfx import OrthographicCamera, PinholeCamera, scene
+
+
+pytestmark = pytest.mark.skipif(
+    scene._embree.problem() is not None, reason="Embree does not work on this machine."
+)
+
+
+def square(z, facing, side=1.0):
+    """A square across the z axis whose front faces `facing` (1 or -1) along it."""
+    half = side / 2
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return Trimesh(corners, faces if facing > 0 else faces[:, ::-1], process=False)
+
+
+def built(meshes, camera, size=(12, 12), **options):
+    mesh = scene.from_trimesh(util.concatenate(meshes))
+    height, width = size
+    gbuffer = scene.gbuffer(mesh, camera, height=height, width=width, backend="embree")
+    return mesh, gbuffer, scene.transfer(mesh, gbuffer, camera, **options)
+
+
+def middle():
+    """Halfway between squares at 0 and 1: it sees all of the one at 1 and no more."""
+    pose = np.eye(4)
+    pose[2, 3] = 0.5
+    return OrthographicCamera(12.0, [6, 6], pose)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    inside = creation.icosphere(3, radius=2.0)
+    inside.invert()
+    camera = PinholeCamera.from_fov(1.5, height=12, width=12)
+    return built([inside], camera, points=400, rank=400)[2]
+
+
+def test_an_enclosure_gets_what_it_sends(ball):
+    """In a sphere every share is the point's part of the surface, wherever the pixel is."""
+    shares = np.asarray(ball.receive @ ball.send)
+    np.testing.assert_allclose(shares.sum(axis=-1), 1, atol=0.03)
+    np.testing.assert_allclose(np.asarray(ball.position) ** 2 @ np.ones(3), 4, rtol=0.02)
+    uneven = 1 + np.asarray(ball.normal) @ [0.3, -0.5, 0.4]
+    np.testing.assert_allclose(shares @ uneven, 1, atol=0.05)
+
+
+def test_one_singular_vector_says_all_of_a_sphere(ball):
+    first = np.asarray(ball.receive[..., :1] @ ball.send[:1])
+    np.testing.assert_allclose(first.sum(axis=-1), 1, atol=0.03)
+
+
+def test_singular_vectors_are_orthonormal_and_the_largest_come_first(ball):
+    np.testing.assert_allclose(ball.send @ ball.send.T, np.eye(400), atol=1e-5)
+    strength = np.linalg.norm(np.asarray(ball.receive).reshape(-1, 400), axis=0)
+    assert strength[0] > 20 * strength[1]
+
+
+def test_parallel_squares_have_their_form_factor():
+    """0.19982 at a distance of one side (Hottel 1931); from the one side only."""
+    send, get = square(0, 1), square(1, -1)
+    transfer = built([send, get], middle(), points=256, rank=64)[2]
+    share = np.asarray(transfer.receive) @ np.asarray(transfer.send).sum(axis=1)
+    assert share.mean() == pytest.approx(0.19982, rel=0.01)
+    turned = built([square(0, -1), get], middle(), points=16, rank=16)[2]
+    np.testing.assert_array_equal(turned.receive, 0)
+
+
+def test_a_wall_between_lets_nothing_through():
+    wall = square(0.25, 1, side=3.0)
+    mesh, _, transfer = built([square(0, 1), square(1, -1), wall], middle(), points=64, rank=8)
+    behind = np.asarray(transfer.position)[:, 2] < 0.1
+    np.testing.assert_allclose(np.asarray(transfer.send)[:, behind], 0, atol=1e-6)
+    assert np.asarray(transfer.receive).any()
+    ends = np.array([[0, 0, 0.9], [0, 0, 0.3], [0.4, 0, 1]])
+    seen = scene.visible(mesh, np.array([[[0, 0, 0.0]], [[0, 0, 1.0]]]), ends)
+    np.testing.assert_array_equal(seen, [[False] * 3, [True] * 3])
+
+
+def test_points_have_the_reflectance_and_the_front_of_what_they_lie_on():
+    mesh, gbuffer, transfer = built([square(0, 1), square(1, -1)], middle(), points=32, rank=4)
+    assert transfer.receive.shape == (12, 12, 4) and transfer.send.shape == (4, 32)
+    assert transfer.receive.dtype == jnp.float32
+    z = np.asarray(transfer.position)[:, 2]
+    np.testing.assert_allclose(np.asarray(transfer.normal)[:, 2], np.where(z < 0.5, 1, -1))
+    np.testing.assert_allclose(
+        np.asarray(transfer.diffuse) - np.asarray(gbuffer.diffuse[0, 0]), 0, atol=1e-6
+    )
+    assert np.abs(np.asarray(transfer.position)[:, :2]).max() <= 0.5
+    again = scene.transfer(mesh, gbuffer, middle(), points=32, rank=4)
+    np.testing.assert_array_equal(transfer.position, again.position)
+
+
+def test_errors_name_the_argument():
+    transfer, visible = inspect.unwrap(scene.transfer), inspect.unwrap(scene.visible)
+    mesh, gbuffer, _ = built([square(1, -1)], middle(), points=2, rank=1)
+    for options, message in (
+        ({"points": 0}, r"`scene.transfer\(points=...\)` must be at least 1, got 0"),
+        ({"points": 2.0}, r"`scene.transfer\(points=...\)` must be an integer, got 2.0"),
+        ({"points": 4, "rank": 5}, r"`scene.transfer\(rank=...\)` must be in \[1, 4\], got 5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            transfer(mesh, gbuffer, middle(), **options)
+    with pytest.raises(ValueError, match=r"`scene.visible\(end\)` must have shape"):
+        visible(mesh, np.zeros((1, 3)), np.zeros((1, 2)))
