@@ -1,8 +1,9 @@
 """One picture from several sources, and which of many sources to take."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -70,15 +71,23 @@ def blend(
     _check_lists("blend", images=images, depths=depths, sources=sources)
     images = [check_image("blend(images)", image) for image in images]
     size = check_options("blend", shape or images[0].shape[:2], method, hole_threshold)
-    pixels = pixel_centers(*size).reshape(-1, 2)
+    depths = _checked("blend", depths, [image.shape[:2] for image in images], sources, target)
     options = {"method": method, "hole_threshold": hole_threshold}
-    layers = []
-    for image, depth, source in zip(images, depths, sources, strict=True):
-        check_source("blend", depth, image.shape[:2])
-        view, along, z = _seen("blend", depth, source, target, pixels, options)
-        picture = view.patch.read(image).astype(images[0].dtype)
-        layers.append((picture, view.mask, along, z))
-    pictures, masks, along, z = (jnp.stack(each) for each in zip(*layers, strict=True))
+    seen = _Seen(target, pixel_centers(*size).reshape(-1, 2), options)
+    return _blended(seen, images, depths, list(sources), size)
+
+
+@eqx.filter_jit
+def _blended(
+    seen: "_Seen", images: list, depths: list, sources: list, size: tuple[int, int]
+) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
+    hole_threshold = seen.options["hole_threshold"]
+
+    def layer(image: Array, depth: Array, source: PinholeCamera) -> tuple[Array, ...]:
+        view, along, z = seen(depth, source)
+        return view.patch.read(image).astype(images[0].dtype), view.mask, along, z
+
+    pictures, masks, along, z = _over_sources(layer, images, depths, sources)
     nearest = jnp.min(jnp.where(masks, z, jnp.inf), axis=0)
     front = masks & (z <= (1 + hole_threshold) * nearest[None])
     weight = jax.lax.stop_gradient(jnp.where(front, along**8, 0))[..., None]
@@ -132,12 +141,18 @@ def choose(
     height, width = check_options("choose", size, "pyramid", hole_threshold)
     rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in (height, width))
     pixels = pixel_centers(height, width)[rows, columns].reshape(-1, 2)
+    depths = _checked("choose", depths, list(map(jnp.shape, depths)), sources, target)
     options = {"method": "pyramid", "hole_threshold": hole_threshold}
-    worths = []
-    for depth, source in zip(depths, sources, strict=True):
-        view, along, _ = _seen("choose", depth, source, target, pixels, options)
-        worths.append(jnp.where(view.mask, along, 0))
-    worth, chosen = jnp.stack(worths), []
+    return _chosen(_Seen(target, pixels, options), depths, list(sources), count)
+
+
+@eqx.filter_jit
+def _chosen(seen: "_Seen", depths: list, sources: list, count: int) -> Choice:
+    def each(depth: Array, source: PinholeCamera) -> Array:
+        view, along, _ = seen(depth, source)
+        return jnp.where(view.mask, along, 0)
+
+    worth, chosen = _over_sources(each, depths, sources), []
     best, reached = jnp.zeros_like(worth[0]), []
     free = jnp.ones(len(worth), bool)
     for _ in range(count):
@@ -159,27 +174,50 @@ def _check_lists(caller: str, **lists: Sequence) -> None:
         )
 
 
-def _seen(
-    caller: str,
-    depth: ArrayLike,
-    source: PinholeCamera,
-    target: Camera,
-    pixels: Float[Array, "ray 2"],
-    options: dict[str, Any],
-) -> tuple[View, Float[Array, " ray"], Float[Array, " ray"]]:
-    """The view of one source, the cosine between its rays and the target's, and its depth."""
-    depth = check_source(caller, depth, jnp.shape(depth))
-    check_cameras(caller, source, target)
-    dtype = working_dtype(depth.dtype)
-    pixels = pixels.astype(dtype)
-    view = look(depth.astype(dtype), source, target, pixels, **options)
-    at_infinity = view.inverse_depth <= 0
-    points = source.unproject(view.pixels, 1 / jnp.where(at_infinity, 1, view.inverse_depth))
-    nowhere = jnp.zeros_like(view.inverse_depth)
-    rays = (
-        normalize(points - source.unproject(view.pixels, nowhere)),
-        normalize(points - target.unproject(pixels, nowhere)),
-    )
-    cosine = jnp.maximum(jnp.sum(rays[0] * rays[1], axis=-1), 0)
-    _, there = target.project(points)
-    return view, jnp.where(at_infinity, 1, cosine), jnp.where(at_infinity, jnp.inf, there)
+def _checked(
+    caller: str, depths: Sequence, shapes: Sequence, sources: Sequence, target: Any
+) -> list[Array]:
+    """The depths as arrays of the given shapes, in types that are computed with."""
+    depths = [check_source(caller, *each) for each in zip(depths, shapes, strict=True)]
+    for source in sources:
+        check_cameras(caller, source, target)
+    return [depth.astype(working_dtype(depth.dtype)) for depth in depths]
+
+
+def _over_sources(function: Callable, *lists: Sequence) -> Any:
+    """The results, stacked; sources that are alike in all shapes and types share a program."""
+    kinds = {str(jax.tree.map(jax.typeof, each)) for each in zip(*lists, strict=True)}
+    stack = lambda *leaves: jnp.stack(leaves)
+    if len(kinds) == 1:
+        stacked = tuple(jax.tree.map(stack, *items) for items in lists)
+        return jax.lax.map(lambda each: function(*each), stacked)
+    results = [function(*each) for each in zip(*lists, strict=True)]
+    return jax.tree.map(stack, *results)
+
+
+class _Seen(eqx.Module):
+    """What some of a target's pixels see of a source."""
+
+    target: Camera
+    pixels: Float[Array, "ray 2"]
+    options: dict[str, Any] = eqx.field(static=True)
+
+    def __call__(
+        self, depth: Float[Array, "height width"], source: PinholeCamera
+    ) -> tuple[View, Float[Array, " ray"], Float[Array, " ray"]]:
+        """The view, the cosine between the source's rays and the target's, and its depth."""
+        pixels = self.pixels.astype(depth.dtype)
+        view = look(depth, source, self.target, pixels, **self.options)
+        at_infinity = view.inverse_depth <= 0
+        points = source.unproject(
+            view.pixels, 1 / jnp.where(at_infinity, 1, view.inverse_depth)
+        )
+        nowhere = jnp.zeros_like(view.inverse_depth)
+        rays = (
+            normalize(points - source.unproject(view.pixels, nowhere)),
+            normalize(points - self.target.unproject(pixels, nowhere)),
+        )
+        cosine = jnp.maximum(jnp.sum(rays[0] * rays[1], axis=-1), 0)
+        _, there = self.target.project(points)
+        along = jnp.where(at_infinity, 1, cosine)
+        return view, along, jnp.where(at_infinity, jnp.inf, there)

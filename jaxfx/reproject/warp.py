@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -68,6 +69,19 @@ def warp(
     depth = check_source("warp", depth, image.shape[:2])
     check_cameras("warp", source, target)
     shape = check_options("warp", shape or image.shape[:2], method, hole_threshold)
+    return _drawn(image, depth, source, target, shape, method, hole_threshold)
+
+
+@eqx.filter_jit
+def _drawn(
+    image: Array,
+    depth: Array,
+    source: PinholeCamera,
+    target: Camera,
+    shape: tuple[int, int],
+    method: str,
+    hole_threshold: int | float,
+) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     dtype = working_dtype(depth.dtype)
     pixels = pixel_centers(*shape, dtype).reshape(-1, 2)
     options = {"method": method, "hole_threshold": hole_threshold}
