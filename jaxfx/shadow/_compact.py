@@ -26,25 +26,26 @@ def fold(
     """`start` after `step(carry, pixels, fetch(pixels))` for chunk by chunk of what is `where`.
 
     In the last chunk pixels past the end stand for none; they are fetched as the last one.
-    What `fetch` gives is carried from step to step, which lays it out in memory: else XLA
-    would fetch it anew for each tap of a filter.
+    What `fetch` gives comes out of a branch, which lays it out in memory: else XLA would fetch
+    it anew for each tap of a filter.
     """
     words = _pack(where)
     ends = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
     chunk = min(_CHUNK, where.size)
+    steps = (ends[-1] + chunk - 1) // chunk
 
     def load(k):
         rank = k * chunk + jnp.arange(chunk, dtype=jnp.int32)
         pixels = jnp.where(rank < ends[-1], _nth_set(words, ends, rank), where.size)
         return pixels, fetch(jnp.minimum(pixels, where.size - 1))
 
-    def body(k, carry):
-        (pixels, fetched), result = carry
-        result = step(result, pixels, fetched)
-        return load(k + 1), result
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(load, steps))
 
-    steps = (ends[-1] + chunk - 1) // chunk
-    return jax.lax.fori_loop(0, steps, body, (load(0), start))[1]
+    def body(k, carry):
+        pixels, fetched = jax.lax.cond(k < steps, load, lambda _: nothing, k)
+        return step(carry, pixels, fetched)
+
+    return jax.lax.fori_loop(0, steps, body, start)
 
 
 def _pack(bits: Bool[Array, " pixel"]) -> UInt32[Array, " word"]:

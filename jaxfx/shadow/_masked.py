@@ -13,7 +13,7 @@ from jaxfx._linear import linear
 from jaxfx.shadow import _taps
 from jaxfx.shadow._compact import fold
 from jaxfx.shadow._taps import Places
-from jaxfx.shadow._windows import extremes
+from jaxfx.shadow._windows import extremes, unions
 from jaxfx.shadow.pcf import average
 from jaxfx.shadow.receivers import Receivers
 
@@ -44,10 +44,9 @@ def find_mask(size, mask, dilation, shadow_map, receivers, bias, slope_bias, sof
 def _near_edges(
     hard: Float[Array, "height width"], dilation: int
 ) -> Bool[Array, "height width"]:
-    # Copies of the frame's pixels add nothing to a window that holds them.
-    padded = jnp.pad(hard, dilation, mode="edge")
-    smallest, largest = extremes(padded, 2 * dilation + 1)
-    return smallest != largest
+    lit, dark = jnp.uint8(1), jnp.uint8(2)
+    padded = jnp.pad(jnp.where(hard > 0, lit, dark), dilation)
+    return unions(padded, 2 * dilation + 1) == lit | dark
 
 
 # A loop that ends with its data would go on to the slowest of a batch: hence one by one.

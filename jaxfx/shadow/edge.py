@@ -18,6 +18,9 @@ from jaxfx.shadow.receivers import Receivers
 
 Mask = Literal["screen", "depth"]
 
+# The share of edges at which a dilation that is left out is enough.
+_USUAL = 0.75
+
 
 class Candidates(NamedTuple):
     """What `edge_pcf` filters, and what that costs.
@@ -59,8 +62,8 @@ def edge_pcf(
       `pcf`: height width, texels and scene units.
     - `mask`: which pixels are filtered.
     - `dilation`: static; pixels by which edges reach, for `mask="screen"`. Outside `jit`,
-      `grad` and `vmap` it may be left out, and is then as many as the filter covers where the
-      picture magnifies the map most, seen at the edges.
+      `grad` and `vmap` it may be left out, and is then as many as the filter covers at three
+      of four edge pixels. Where light grazes a surface it covers more, without limit.
 
     **Returns:** height width, in [0, 1], in the type of the receivers. Any number of pixels
     may need the filter; where none does, none is filtered. Batches are done one by one.
@@ -68,8 +71,9 @@ def edge_pcf(
     **Raises:** `ValueError` as `pcf` does, for an unknown mask, a dilation that is not 1 or
     more, or none with `mask="screen"` under a transform.
 
-    **Gradient:** `pcf`'s in the pixels that are filtered, at its cost; zero in the others:
-    exact with `mask="depth"`, missing with `"screen"` where that misses. The mask is constant.
+    **Gradient:** `pcf`'s in the pixels that are filtered, at the cost of these; zero in the
+    others: exact with `mask="depth"`, missing with `"screen"` where that misses. The mask is
+    constant. Second derivatives cost a full filter.
 
     Source: Yu & Choi, an improved PCF technique for the generation of shadows, section 4;
     earlier, Uralsky 2005 (GPU Gems 2, chapter 17) and Evans et al. filter edges alone. Our
@@ -114,7 +118,7 @@ def candidates(
     return Candidates(where, tests + taps)
 
 
-def _reach(name: str, mask: Any, dilation: Any, size: int, data: tuple[Any, ...]) -> int:
+def _reach(name: str, mask: Any, dilation: Any, size: int, data: Any) -> int:
     """The dilation, checked; found if it is left out; 0 where there is none."""
     if mask not in get_args(Mask):
         raise ValueError(f"`{name}(mask=...)` must be one of {get_args(Mask)}, got {mask!r}.")
@@ -126,33 +130,31 @@ def _reach(name: str, mask: Any, dilation: Any, size: int, data: tuple[Any, ...]
                 f"`{name}(dilation=...)` must be given under `jit`, `grad` and `vmap`, where "
                 "it can't be taken from the receivers: static, in pixels, got None."
             )
-        dilation = enough_dilation(*data[:4], size)
+        dilation = usual_dilation(*data[:4], size=size)
     if isinstance(dilation, bool) or not isinstance(dilation, int) or dilation < 1:
         raise ValueError(f"`{name}(dilation=...)` must be 1 or more pixels, got {dilation!r}.")
     return dilation
 
 
-def enough_dilation(shadow_map, receivers: Receivers, bias, slope_bias, size: int) -> int:
-    """How many pixels a filter reaches at an edge where they are smallest in the map.
+def usual_dilation(
+    shadow_map: Array, receivers: Receivers, bias: Array, slope_bias: Array, size: int
+) -> int:
+    """How many pixels a filter reaches at three of four edge pixels.
 
     A pixel's step in the map is at least the smallest singular value of the derivative of
-    (u, v) in the picture. Where that jumps, at a silhouette, it is no smaller.
+    (u, v) in the picture. Where that jumps, at a silhouette, it is no smaller. Where light
+    grazes, it tends to 0: what every edge needs is soon the whole picture.
     """
     where = _candidates(size, "screen", 1, shadow_map, receivers, bias, slope_bias, None)
     u, v, z = (np.asarray(each, np.float64) for each in receivers[:3])
     if min(u.shape) < 2:
         return max(u.shape)
-    (uy, ux), (vy, vx) = np.gradient(u), np.gradient(v)
-    squares = ux * ux + uy * uy + vx * vx + vy * vy
-    determinant = np.abs(ux * vy - uy * vx)
-    root = np.sqrt(np.maximum(squares * squares - 4 * determinant * determinant, 0))
-    # The smaller root of x**2 - squares x + determinant**2, without cancellation.
-    smallest = determinant / np.sqrt(np.maximum((squares + root) / 2, 1e-300))
-    steps = smallest[np.asarray(where) & (z > 0)]
-    if steps.size == 0:
+    jacobian = np.stack([*np.gradient(u), *np.gradient(v)], axis=-1)
+    at_edges = jacobian[np.asarray(where) & (z > 0)].reshape(-1, 2, 2)
+    if len(at_edges) == 0:
         return 1
-    pixels = (size // 2 + 1) / max(float(steps.min()), 1e-9)
-    return int(min(np.ceil(pixels) + 1, max(u.shape)))
+    step = np.quantile(np.linalg.svd(at_edges, compute_uv=False)[:, -1], 1 - _USUAL)
+    return int(min(np.ceil((size // 2 + 1) / max(step, 1e-9)) + 1, max(u.shape)))
 
 
 @ft.partial(jax.jit, static_argnums=(0, 1, 2))

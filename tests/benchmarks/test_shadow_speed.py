@@ -12,26 +12,13 @@ import jax.numpy as jnp
 import native_shadow
 import numpy as np
 import pytest
+from shadow_scenes import FLOOR, two_discs
 
 from jaxfx import shadow
-from jaxfx.shadow.edge import enough_dilation
+from jaxfx.shadow.edge import usual_dilation
 
 
-SIDE, STEP, BIAS = 512, 0.9, 0.05
-FLOOR = 5.0
-
-
-def two_discs(size):
-    """The map and the receivers: NumPy, float32."""
-    y, x = np.mgrid[:SIDE, :SIDE] + 0.5
-    shadow_map = np.full((SIDE, SIDE), FLOOR)
-    for cx, cy, radius, depth in ((0.3, 0.35, 460, 2.0), (0.68, 0.62, 560, 3.0)):
-        inside = (x - cx * SIDE) ** 2 + (y - cy * SIDE) ** 2 < (radius / size) ** 2
-        shadow_map[inside] = depth
-    turn = STEP * np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]])
-    u, v = np.einsum("ab,bji->aji", turn, np.stack([x, y]) - SIDE / 2) + SIDE / 2
-    fields = (u, v, np.full_like(u, FLOOR), 0 * u)
-    return shadow_map.astype(np.float32), [field.astype(np.float32) for field in fields]
+SIDE, BIAS = 512, 0.05
 
 
 def run(benchmark, function):
@@ -50,7 +37,7 @@ def masked(mask, size, shadow_map, receivers):
     if mask == "depth":
         return {"size": size, "mask": mask}
     data = jnp.asarray(shadow_map), shadow.Receivers(*map(jnp.asarray, receivers))
-    reach = enough_dilation(*data, jnp.float32(BIAS), jnp.float32(0), size)
+    reach = usual_dilation(*data, jnp.float32(BIAS), jnp.float32(0), size)
     return {"size": size, "mask": mask, "dilation": reach}
 
 

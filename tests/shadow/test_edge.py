@@ -10,7 +10,7 @@ import pytest
 
 from jaxfx import shadow
 from jaxfx.shadow import _compact
-from jaxfx.shadow._windows import extremes
+from jaxfx.shadow._windows import extremes, unions
 
 from .conftest import naive_pcf, random_case
 
@@ -104,6 +104,9 @@ def test_running_extremes(shape, size):
     for j, i in np.ndindex(*smallest.shape):
         window = image[j : j + size, i : i + size]
         assert (smallest[j, i], largest[j, i]) == (window.min(), window.max())
+    bits = (1 << (image > 0)).astype(np.uint8)
+    seen = (smallest <= 0) * 1 + (largest > 0) * 2
+    np.testing.assert_array_equal(unions(jnp.asarray(bits), size), seen)
 
 
 # The screen mask's losses: a wall at depth 2 with a floor at 4, seen at some magnification.

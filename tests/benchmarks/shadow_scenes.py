@@ -1,0 +1,190 @@
+"""Scenes whose shadows are known: by construction, by rays that Embree traces, by slabs."""
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+from jaxfx import (
+    AmbientLight,
+    DirectionalLight,
+    OrthographicCamera,
+    PinholeCamera,
+    SpotLight,
+    fit,
+    relight,
+    scene,
+    shadow,
+)
+from jaxfx._sampling import pixel_centers
+
+
+WHITE = [1.0, 1.0, 1.0]
+
+# Two discs over a floor that is seen turned, a pixel 0.9 texels wide; smaller for larger
+# filters, so that 3 to 5 % of the pixels lie in a penumbra.
+STEP, FLOOR = 0.9, 5.0
+
+
+def two_discs(size, side=512):
+    """The map and the receivers: NumPy, float32."""
+    y, x = np.mgrid[:side, :side] + 0.5
+    shadow_map = np.full((side, side), FLOOR)
+    for cx, cy, radius, depth in ((0.3, 0.35, 460, 2.0), (0.68, 0.62, 560, 3.0)):
+        inside = (x - cx * side) ** 2 + (y - cy * side) ** 2 < (radius / size) ** 2
+        shadow_map[inside] = depth
+    turn = STEP * np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]])
+    u, v = np.einsum("ab,bji->aji", turn, np.stack([x, y]) - side / 2) + side / 2
+    fields = (u, v, np.full_like(u, FLOOR), 0 * u)
+    return shadow_map.astype(np.float32), [field.astype(np.float32) for field in fields]
+
+
+def plate(magnification, width, side=96, texels=64):
+    """A floor at 4 below a plate of `width` texels at 2; a texel is so many pixels wide."""
+    shadow_map = np.full((texels, texels), 5.0)
+    first = (texels - width) // 2
+    shadow_map[:, first : first + width] = 2.0
+    x = (np.arange(side) + 0.5 - side / 2) / magnification + texels / 2
+    u, v = np.meshgrid(x, x)
+    return shadow_map, shadow.Receivers(*map(jnp.asarray, (u, v, np.full_like(u, 4.0), 0 * u)))
+
+
+class Still:
+    """A view of the still life: its depth, normals and points, and rays from these."""
+
+    sun = np.array([0.6, -0.67, -0.42])
+    lamp, target = np.array([-1.2, 2.6, -1.6]), np.array([0.0, 0.4, -3.8])
+
+    def __init__(self, side=96):
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self.side, self.mesh = side, scene.still_life()
+        self.eye = scene.default_camera(self.mesh, height=side, width=side)
+        found = scene.gbuffer(self.mesh, self.eye, height=side, width=side, backend="embree")
+        self.depth, self.normal = found.depth, found.normal
+        centers = pixel_centers(side, side, found.depth.dtype)
+        self.points = np.asarray(self.eye.unproject(centers, found.depth), np.float64)
+        self.rays = EmbreeScene(robust=True)
+        TriangleMesh(self.rays, self.mesh.vertices[self.mesh.faces].astype(np.float32))
+
+    def truth(self, towards, distance=np.inf):
+        """Which points see the light, and which face it at more than a grazing angle."""
+        towards = np.broadcast_to(towards, self.points.shape)
+        towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+        normal = np.asarray(self.normal, np.float64)
+        rays = (self.points + 1e-3 * normal, towards)
+        rays = (np.ascontiguousarray(each.reshape(-1, 3), np.float32) for each in rays)
+        first = self.rays.run(*rays, query="DISTANCE").reshape(self.side, self.side)
+        clear = first > 1e30 if np.isinf(distance).all() else first > distance
+        return clear, np.sum(normal * towards, axis=-1) > 0.05
+
+    def from_position(self, position):
+        towards = position - self.points
+        return self.truth(towards, np.linalg.norm(towards, axis=-1))
+
+    def compared(self, cameras, map_size):
+        """The maps side by side, and the receivers."""
+        options = {"height": map_size, "width": map_size, "backend": "embree"}
+        maps = [np.asarray(scene.depth(self.mesh, camera, **options)) for camera in cameras]
+        seen = shadow.receivers(self.depth, self.eye, cameras, normal=self.normal)
+        return np.concatenate(maps, axis=1), seen
+
+    def under_the_sun(self, map_size):
+        ends = self.points.reshape(-1, 3)
+        centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
+        radius = np.linalg.norm(ends - centre, axis=-1).max()
+        light = DirectionalLight(self.sun, WHITE)
+        cameras = shadow.light_cameras(light, map_size=map_size, centre=centre, radius=radius)
+        return self.compared(cameras, map_size)
+
+    def under_a_square_lamp(self, map_size, light_size):
+        """The camera, what is compared, the share of 36 rays, and where that is a penumbra."""
+        light = SpotLight(self.lamp, self.target - self.lamp, WHITE, 0.7, 0.9)
+        (camera,) = shadow.light_cameras(light, map_size=map_size)
+        right, down = light_size * np.asarray(camera.world_from_camera, np.float64)[:3, :2].T
+        steps = (np.arange(6) + 0.5) / 6 - 0.5
+        rays = [
+            self.from_position(self.lamp + a * right + b * down) for a in steps for b in steps
+        ]
+        clear, facing = (np.array(each) for each in zip(*rays, strict=True))
+        share, data = clear.mean(axis=0), self.compared((camera,), map_size)
+        far = np.abs(np.stack(data[1][:2]) - map_size / 2) < 0.47 * map_size
+        inside = facing.all(axis=0) & far.all(axis=0) & (data[1].z > 0)
+        return camera, data, share, inside & (share > 0) & (share < 1)
+
+
+def acne_and_leaks(visible, clear, facing):
+    """The share of what is lit that is shown dark; of what is dark, shown lit."""
+    visible = np.asarray(visible)
+    return np.mean(visible[facing & clear] == 0), np.mean(visible[facing & ~clear] == 1)
+
+
+class Boxes:
+    """Boxes on a floor, seen straight from above: every visible face is level, and so equally
+    bright wherever the sun is. It is known by its shadow alone.
+    """
+
+    bounds = np.array(
+        [
+            [[-3.0, -0.2, -3.0], [3.0, 0.0, 3.0]],
+            [[-0.15, 0.0, -0.15], [0.15, 1.2, 0.15]],
+            [[-1.2, 0.0, 0.3], [-0.7, 0.5, 1.0]],
+            [[0.6, 0.0, -1.1], [1.3, 0.3, -0.9]],
+        ]
+    )
+    up = np.array([0.0, 1.0, 0.0])
+    sun = np.array([0.6, -1.0, 0.35]) / np.linalg.norm([0.6, -1.0, 0.35])
+    # Texels a unit, in each round of a search; a surface blurs over one of them.
+    scales = (8.0, 16.0, 32.0, 64.0)
+
+    def __init__(self, side=64, map_size=160):
+        self.size, self.map_size = {"height": side, "width": side}, map_size
+        parts = [trimesh.creation.box(bounds=bounds) for bounds in self.bounds]
+        self.mesh = scene.from_trimesh(trimesh.util.concatenate(parts))
+        pose = np.array([[1.0, 0, 0, 0], [0, 0, -1, 5], [0, 1, 0, 0], [0, 0, 0, 1]])
+        self.eye = OrthographicCamera(side / 5, jnp.array([side / 2, side / 2]), pose)
+        self.gbuffer = scene.gbuffer(self.mesh, self.eye, **self.size)
+
+    def in_sun(self, direction):
+        """The pixels that no box hides from the sun, by slabs: 0 or 1."""
+        depth = jnp.asarray(self.gbuffer.depth, float)
+        points = np.asarray(self.eye.unproject(pixel_centers(**self.size), depth))
+        points = points + 1e-4 * self.up
+        clear = np.ones(points.shape[:-1], bool)
+        for low, high in self.bounds:
+            one, other = (low - points) / -direction, (high - points) / -direction
+            enter, leave = np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
+            clear &= (leave < 1e-6) | (leave < enter)
+        return clear.astype(float)
+
+    def photograph(self):
+        """Under a sun and a sky, with hard shadows."""
+        sky, sun = AmbientLight([0.2, 0.25, 0.3]), DirectionalLight(self.sun, [2.0, 1.8, 1.5])
+        image = relight.shade(self.gbuffer, self.eye, sky)
+        return image + relight.shade(self.gbuffer, self.eye, sun, self.in_sun(self.sun))
+
+    def turned(self, angle, about):
+        """The sun's direction turned by an angle to one side."""
+        across = np.cross(self.sun, self.up) / np.linalg.norm(np.cross(self.sun, self.up))
+        side = np.cos(about) * across + np.sin(about) * np.cross(self.sun, across)
+        return np.cos(angle) * self.sun + np.sin(angle) * side
+
+    def miss(self, light):
+        """Degrees between a light and the sun."""
+        length = np.linalg.norm(light.direction)
+        return float(np.degrees(np.arccos(np.clip(self.sun @ light.direction / length, -1, 1))))
+
+    def seen_from(self, direction, scale):
+        """The shadow map of a sun, and its camera."""
+        size = {"height": self.map_size, "width": self.map_size}
+        centre = jnp.array([self.map_size / 2, self.map_size / 2])
+        eye = -8 * np.asarray(direction)
+        look = PinholeCamera.look_at(eye, np.zeros(3), up=[0, 1, 0], fov_y=1.0, **size)
+        camera = OrthographicCamera(scale, centre, look.world_from_camera)
+        return scene.depth(self.mesh, camera, **size), camera
+
+    def shadows(self, lights, index):
+        """For `fit.lights`: a finer map in each round, from the sun found so far."""
+        scale = self.scales[index]
+        seen = self.seen_from(lights[1].direction, scale)
+        return None, fit.MovingShadow(*seen, self.gbuffer, self.eye, softness=1 / scale)
