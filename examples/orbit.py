@@ -1,0 +1,139 @@
+"""One picture with its depth, seen from around.
+
+Renders a mesh, or takes a picture and its depth from an EXR file, and turns the camera about
+the median depth of what it shows, by reprojecting that single picture. What it did not see, and
+what passes behind something near, is hatched. Writes `orbit.gif` and `orbit.png`, a contact
+sheet with the turned views and, for a mesh, the same views rendered anew.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from jaxfx import PinholeCamera, exr, relight, reproject, scene
+
+
+# Pictures on the contact sheet.
+SHEET = 5
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    given = parser.add_mutually_exclusive_group()
+    given.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
+    given.add_argument("--picture", type=Path, help="an EXR file with colour and `depth`")
+    parser.add_argument(
+        "--size", type=int, default=256, help="side of a mesh's picture, pixels"
+    )
+    parser.add_argument("--fov", type=float, default=45.0, help="of --picture, degrees")
+    parser.add_argument("--degrees", type=float, default=6.0, help="to either side")
+    parser.add_argument("--frames", type=int, default=24, help="of the GIF")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
+    arguments = parser.parse_args()
+    for name, least in (("size", 16), ("frames", SHEET)):
+        if getattr(arguments, name) < least:
+            parser.error(f"--{name} must be at least {least}, got {getattr(arguments, name)}")
+    if not 0 < arguments.fov < 180:
+        parser.error(f"--fov must be in (0, 180) degrees, got {arguments.fov}")
+    return arguments
+
+
+def load(arguments: argparse.Namespace):
+    """The picture, its depth, its camera and, for a mesh, how to render another view."""
+    try:
+        if arguments.picture is not None:
+            channels = exr.read(arguments.picture)
+            image, depth = jnp.asarray(channels[""]), jnp.asarray(channels["depth"])
+            fov, (height, width) = np.deg2rad(arguments.fov), depth.shape
+            return image, depth, PinholeCamera.from_fov(fov, height=height, width=width), None
+        mesh = scene.still_life() if arguments.scene is None else scene.load(arguments.scene)
+        eye = scene.default_camera(mesh, height=arguments.size, width=arguments.size)
+        lights = scene.default_lights(eye)
+
+        def taken(eye):
+            buffer = scene.gbuffer(mesh, eye, height=arguments.size, width=arguments.size)
+            return relight.render(buffer, eye, lights), buffer.depth
+
+        return *taken(eye), eye, lambda eye: taken(eye)[0]
+    except KeyError as error:
+        sys.exit(f"orbit.py: error: --picture must hold colour and `depth`, it lacks {error}")
+    except (OSError, ValueError, RuntimeError) as error:
+        sys.exit(f"orbit.py: error: {error}")
+
+
+def make_folder(folder: Path) -> Path:
+    """The folder, made if need be; said now rather than at the end."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        sys.exit(f"orbit.py: error: --out must be a folder to write to: {error}")
+    return folder
+
+
+def turned(eye: PinholeCamera, degrees: float, distance: float) -> PinholeCamera:
+    """The camera turned about a point of its axis, around the picture's vertical."""
+    angle = np.deg2rad(degrees)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.eye(4)
+    turn[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    turn[:3, 3] = [distance * s, 0, distance * (1 - c)]
+    pose = np.asarray(eye.world_from_camera, float) @ turn
+    return PinholeCamera(eye.intrinsics, jnp.asarray(pose, eye.intrinsics.dtype))
+
+
+def hatched(image, alpha) -> np.ndarray:
+    """The picture, with dark stripes where nothing is known."""
+    stripes = np.add.outer(*map(np.arange, alpha.shape)) // 3 % 2 * 0.04 + 0.01
+    return np.where(np.asarray(alpha)[..., None] > 0, image, stripes[..., None])
+
+
+def to_bytes(image) -> np.ndarray:
+    """sRGB bytes of linear radiance."""
+    value = np.clip(np.asarray(image, float), 0, 1)
+    curve = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.round(255 * curve).astype(np.uint8)
+
+
+def main() -> None:
+    arguments = parse()
+    out = make_folder(arguments.out)
+    image, depth, eye, render = load(arguments)
+    seen = np.asarray(depth)[np.isfinite(depth) & (np.asarray(depth) > 0)]
+    if not seen.size:
+        sys.exit("orbit.py: error: the picture has no depth anywhere")
+    distance = float(np.median(seen))
+
+    view = jax.jit(lambda target: reproject.warp(image, depth, eye, target))
+
+    def drawn(degrees):
+        return hatched(*view(turned(eye, degrees, distance)))
+
+    turns = arguments.degrees * np.sin(
+        np.arange(arguments.frames) * 2 * np.pi / arguments.frames
+    )
+    frames = [Image.fromarray(to_bytes(drawn(degrees))) for degrees in turns]
+    frames[0].save(
+        out / "orbit.gif", save_all=True, append_images=frames[1:], duration=60, loop=0
+    )
+    stops = np.linspace(-arguments.degrees, arguments.degrees, SHEET)
+    rows = [[drawn(degrees) for degrees in stops]]
+    if render is not None:
+        rows.append([np.asarray(render(turned(eye, degrees, distance))) for degrees in stops])
+    sheet = np.concatenate([np.concatenate(list(map(to_bytes, row)), axis=1) for row in rows])
+    Image.fromarray(sheet).save(out / "orbit.png")
+    share = float(np.mean(view(turned(eye, arguments.degrees, distance))[1]))
+    print(f"at {arguments.degrees:g} degrees {100 * share:.0f} % of the pixels are known")
+    print(f"wrote {out / 'orbit.gif'} and {out / 'orbit.png'}")
+
+
+if __name__ == "__main__":
+    main()
