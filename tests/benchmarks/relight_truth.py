@@ -45,6 +45,16 @@ def shadow_of(mesh, gbuffer, camera, light, map_size=1024):
     return shadow.hard(jnp.concatenate(maps, axis=1), seen, bias=2e-3, slope_bias=1.0)
 
 
+def unshadowed(mesh, position, light):
+    """1 where nothing stands between a point and the light, else 0."""
+    if isinstance(light, DirectionalLight):
+        way = np.asarray(light.direction, float)
+        end = np.asarray(position) - 4 * mesh.scale * way / np.linalg.norm(way)
+    else:
+        end = np.asarray(light.position, float)
+    return np.asarray(scene.visible(mesh, position, end), np.float32)
+
+
 def emitter(light):
     """The light in Mitsuba's words."""
     rgb = lambda color: {"type": "rgb", "value": np.asarray(color, float).tolist()}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import relight_scenes as scenes
 
-from jaxfx import PointLight, relight
+from jaxfx import PointLight, Transfer, relight
 
 
 SIZE = (480, 640)
@@ -44,6 +44,18 @@ def test_paint(benchmark, what):
     mask = gbuffer.depth < jnp.median(gbuffer.depth)
     new = {"diffuse": np.ones(3)} if what == "diffuse" else {"roughness": np.array(0.4)}
     run(benchmark, lambda: state.paint(mask, **new).image)
+
+
+@pytest.mark.parametrize("rank", [16, 64, 256])
+def test_indirect(benchmark, rank):
+    """The product is what it is, whatever the numbers in it."""
+    benchmark.group = "one bounce of a light from 1024 points, by rank"
+    gbuffer, _ = scenes.cache(SIZE)
+    rng = np.random.default_rng(0)
+    some = lambda *shape: rng.standard_normal(shape, np.float32)
+    transfer = Transfer(some(*SIZE, rank), some(rank, 1024), *(some(1024, 3) for _ in range(3)))
+    light = scenes.lights(1)
+    run(benchmark, lambda: relight.indirect(gbuffer, transfer, light))
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 8])

@@ -1,5 +1,7 @@
 """Deep frame buffers in EXR files."""
 
+import re
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -75,7 +77,16 @@ def test_the_passes_are_layers(tmp_path):
         np.testing.assert_array_equal(layer, getattr(before, name))
     header = OpenEXR.File(str(tmp_path / "a.exr"), header_only=True).header()
     names = {channel.name for channel in header["channels"]}
-    assert {"normal.X", "depth.Z", "shader.V", "color.R"} < names
+    colors = {
+        f"{name}.{c}" for name in ("color", "ambient", "diffuse", "specular") for c in "RGB"
+    }
+    flat = {"normal.X", "normal.Y", "normal.Z", "depth.Z", "shader.V", "roughness.V"}
+    assert names == colors | flat
+    # What Blender and Nuke ask of a name that they are to show as it is: one dot; a layer of
+    # letters alone, which neither cleans; and a single letter that both know, or V.
+    assert all(re.fullmatch(r"[a-z]+\.([RGBAXYZ]|V)", name) for name in names)
+    # Nuke keeps this name for depth, and Blender takes bare X, Y and Z for a vector.
+    assert "depth.Z" in names and not names & set("XYZ")
 
 
 def layers_of(buffer):

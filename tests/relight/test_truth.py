@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxfx import DirectionalLight, metrics, relight, scene
+from jaxfx import metrics, relight, scene
 from jaxfx._sampling import pixel_centers
 
 
@@ -39,22 +39,12 @@ def test_direct_light_without_shadows_is_the_path_tracers_to_rounding(stage):
     assert metrics.psnr(image, expected) > 40
 
 
-def unshadowed(mesh, position, light):
-    """Whether a point's way to a light is free, as a float."""
-    if isinstance(light, DirectionalLight):
-        way = np.asarray(light.direction, float)
-        ends = position - 100 * way / np.linalg.norm(way)
-    else:
-        ends = np.asarray(light.position, float)
-    return np.asarray(scene.visible(mesh, position, ends), float)
-
-
 def test_direct_light_with_shadows_is_the_path_tracers_to_rounding(stage):
     mesh, camera, gbuffer = stage
     lights = [*truth.LIGHTS.values()]
     position = camera.unproject(pixel_centers(*SIZE), gbuffer.depth.astype(float))
     position = np.asarray(position)
-    visible = [unshadowed(mesh, position, light).astype(np.float32) for light in lights]
+    visible = [truth.unshadowed(mesh, position, light).astype(np.float32) for light in lights]
     image = np.asarray(relight.start(gbuffer, camera, lights, visibilities=visible).image)
     expected = all_of(stage, shadows=True)
     error = np.abs(image - expected).max(axis=-1) / expected.max()
@@ -68,7 +58,7 @@ def test_a_bounce_is_the_path_tracers_but_for_the_noise_of_both():
     camera = scene.default_camera(mesh, height=size[0], width=size[1])
     gbuffer, light = truth.lambert(mesh, camera, size), truth.LIGHTS["directional"]
     transfer = scene.transfer(mesh, gbuffer, camera, points=512, rank=64)
-    lit = unshadowed(mesh, np.asarray(transfer.position, float), light)
+    lit = truth.unshadowed(mesh, np.asarray(transfer.position, float), light)
     image = np.asarray(relight.indirect(gbuffer, transfer, [light], lit=[lit]))
     expected, noise = truth.bounced(mesh, camera, light, size, 128)
     error, size = (np.sqrt(np.mean(v**2)) for v in (image - expected, expected))
