@@ -1,8 +1,10 @@
 """The lens and the amplifications of a picture with depth of field."""
 
+import dataclasses
+import functools as ft
 import math
 from collections.abc import Callable, Collection
-from typing import Any, final
+from typing import Any, Literal, final, get_args
 
 import equinox as eqx
 import jax
@@ -13,12 +15,14 @@ from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
 from jaxfx._numerics import check, check_depth, check_image, parameter
+from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import largest_coc, scatter
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
 from jaxfx.lens import ThinLens
 
 
 PARAMETERS = ("aperture", "focus_distance", "gamma", "epsilon")
+LAYERED_PARAMETERS = ("aperture", "focus_distance", "threshold")
 
 # Start values of zero have no logarithm.
 _SMALLEST = 1e-6
@@ -27,6 +31,7 @@ _EPSILON_RESTARTS = (2.0, 0.5)
 # one goes on with more room from where it ran out.
 _ROOM, _ROUNDS = 1.5, 4
 
+Method = Literal["scatter", "layered"]
 _Unknowns = dict[str, Float[Array, ""]]
 
 
@@ -34,9 +39,9 @@ _Unknowns = dict[str, Float[Array, ""]]
 class DofFit(eqx.Module):
     """What `dof` found.
 
-    - `lens`, `gamma`, `epsilon`: the parameters, lengths in scene units, a number, and pixels;
-      frozen ones as they were given.
-    - `image`: height width channel, `scatter` with them.
+    - `lens`, `gamma`, `epsilon`, `threshold`: the parameters, lengths in scene units, a number,
+      and pixels twice; frozen ones, and those of the other method, as they were given.
+    - `image`: height width channel, the picture with them.
     - `losses`: the mean squared residual at the start and after every step, in squared units
       of radiance; it may rise where the search starts again.
     - `uncertainty`: a standard error for each fitted parameter, in its own unit, as if the
@@ -51,6 +56,7 @@ class DofFit(eqx.Module):
     lens: ThinLens
     gamma: Float[Array, ""]
     epsilon: Float[Array, ""]
+    threshold: Float[Array, ""]
     image: Float[Array, "height width channel"]
     losses: Float[Array, " steps"]
     uncertainty: dict[str, Float[Array, ""]]
@@ -71,49 +77,61 @@ def dof(
     *,
     gamma: Float[ArrayLike, ""] | float = 1.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
+    method: Method = "scatter",
+    threshold: Float[ArrayLike, ""] | float = 2.0,
+    behind: tuple[Float[ArrayLike, "height width channel"], Float[ArrayLike, "height width"]]
+    | None = None,
     max_coc: int | float | None = None,
     solver: Solver | None = None,
-    parameters: Collection[str] = PARAMETERS,
+    parameters: Collection[str] | None = None,
     max_steps: int = 64,
     throw: bool = True,
     progress: bool = True,
 ) -> DofFit:
-    """The lens and the amplifications that make `dof.scatter` look most like a reference.
+    """The lens and the other parameters that make a method look most like a reference.
 
-    Least squares over all pixels and channels. Aperture, focus distance and epsilon are
-    searched by their logarithms and gamma by its inverse softplus, so that each stays positive.
-    The squares have local minima in epsilon: from the solution the search starts again with
-    half and with twice its epsilon, and the best of the three ends is kept.
+    Least squares over all pixels and channels. All but gamma are searched by their logarithms
+    and gamma by its inverse softplus, so that each stays positive. The squares have local
+    minima in epsilon: from the solution the search starts again with half and with twice its
+    epsilon, and the best of the three ends is kept.
 
     **Arguments:**
 
     - `reference`: height width channel, linear radiance: a photograph or a multi-pass picture.
-    - `image`, `depth`: height width channel and height width, as in `dof.scatter`.
+    - `image`, `depth`: height width channel and height width, as in the method.
     - `lens`: where the search starts, lengths in scene units; `focal_pixels` is never fitted.
-    - `gamma`, `epsilon`: where the search starts, no unit and pixels.
+    - `gamma`, `epsilon`: where the search starts, no unit and pixels; of `"scatter"`.
+    - `method`: the one of `jaxfx.dof` whose parameters are sought.
+    - `threshold`, `behind`: where the search starts, in pixels, and the second layer, as in
+      `dof.layered`; of `"layered"`.
     - `max_coc`: static; the largest diameter, in pixels, that the search may draw. By default
       half as large again as the start's largest, and larger wherever that proves too small.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
-    - `parameters`: the names to fit, out of `fit.PARAMETERS`; the others stay as given.
+    - `parameters`: the names to fit, out of `fit.PARAMETERS` or, of `"layered"`, out of
+      `fit.LAYERED_PARAMETERS`; the others stay as given. By default all of them.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the solver fails; else the failure stands in the result.
     - `progress`: show a bar on stderr.
 
     **Returns:** a `DofFit`.
 
-    **Raises:** `ValueError` for what `dof.scatter` refuses, for shapes that differ, an unknown
+    **Raises:** `ValueError` for what the method refuses, for shapes that differ, an unknown
     or empty choice of parameters, a zero aperture to start from, or a picture that is not
     finite. `RuntimeError` where the solver fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
     """
     reference, image, depth = _pictures(reference, image, depth)
-    start = _start(lens, gamma, epsilon, image.dtype)
-    unknowns = {name: _unconstrain(name, start[name]) for name in _names(parameters)}
+    if method not in get_args(Method):
+        raise ValueError(
+            f"`dof(method=...)` must be one of {get_args(Method)}, got {method!r}."
+        )
+    start = _start(lens, gamma, epsilon, threshold, image.dtype)
+    unknowns = {name: _unconstrain(name, start[name]) for name in _names(method, parameters)}
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
-    model = _Model(image, depth, lens.focal_pixels, start, max_coc)
+    model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
     with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
         solve = lambda model, y: descend(
             _Residual(model, reference), y, solver=solver, max_steps=max_steps, bar=bar
@@ -134,6 +152,7 @@ def dof(
         model.lens(found),
         values["gamma"],
         values["epsilon"],
+        values["threshold"],
         fitted,
         jnp.stack(end.losses),
         dict(zip(found, errors, strict=True)),
@@ -158,8 +177,8 @@ def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Arr
     return reference.astype(image.dtype), image, depth
 
 
-def _start(lens: Any, gamma: Any, epsilon: Any, dtype: DTypeLike) -> _Unknowns:
-    """All four parameters where the search starts, checked, in one type."""
+def _start(lens: Any, gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike) -> _Unknowns:
+    """All parameters where the search starts, checked, in one type."""
     if not isinstance(lens, ThinLens):
         raise ValueError(f"`dof(lens)` must be a ThinLens, got {type(lens).__name__}.")
     check("dof(lens.aperture)", lens.aperture, lambda v: v > 0, "positive to start a search")
@@ -168,17 +187,19 @@ def _start(lens: Any, gamma: Any, epsilon: Any, dtype: DTypeLike) -> _Unknowns:
         "focus_distance": lens.focus_distance,
         "gamma": parameter("dof(gamma=...)", gamma),
         "epsilon": parameter("dof(epsilon=...)", epsilon),
+        "threshold": parameter("dof(threshold=...)", threshold),
     }
-    for name in ("gamma", "epsilon"):
+    for name in ("gamma", "epsilon", "threshold"):
         check(f"dof({name}=...)", start[name], lambda v: v >= 0, "0 or positive")
     return {name: value.astype(dtype) for name, value in start.items()}
 
 
-def _names(parameters: Collection[str]) -> list[str]:
-    names = [name for name in PARAMETERS if name in parameters]
-    if not names or len(names) != len(parameters):
+def _names(method: Method, parameters: Collection[str] | None) -> list[str]:
+    known = PARAMETERS if method == "scatter" else LAYERED_PARAMETERS
+    names = [name for name in known if parameters is None or name in parameters]
+    if not names or (parameters is not None and len(names) != len(parameters)):
         raise ValueError(
-            f"`dof(parameters=...)` must name some of {PARAMETERS}, got {tuple(parameters)}."
+            f"`dof(parameters=...)` must name some of {known}, got {tuple(parameters or ())}."
         )
     return names
 
@@ -197,12 +218,14 @@ def _constrain(unknowns: _Unknowns, dtype: DTypeLike) -> _Unknowns:
 
 
 class _Model(eqx.Module):
-    """`scatter` as a function of some of its parameters, the others as at the start."""
+    """The method as a function of some of its parameters, the others as at the start."""
 
     image: Float[Array, "height width channel"]
     depth: Float[Array, "height width"]
+    behind: tuple[Any, Any] | None
     focal_pixels: Float[Array, ""]
     start: _Unknowns
+    method: Method = eqx.field(static=True)
     max_coc: int | float | None = eqx.field(static=True)
 
     def lens(self, values: _Unknowns) -> ThinLens:
@@ -211,15 +234,15 @@ class _Model(eqx.Module):
 
     def __call__(self, values: _Unknowns) -> Float[Array, "height width channel"]:
         lens, values = self.lens(values), self.start | values
-        gamma, epsilon = values["gamma"], values["epsilon"]
-        return scatter(
-            self.image, self.depth, lens, gamma=gamma, epsilon=epsilon, max_coc=self.max_coc
-        )
+        names = ("gamma", "epsilon") if self.method == "scatter" else ("threshold",)
+        options: dict[str, Any] = {name: values[name] for name in names}
+        draw = scatter if self.method == "scatter" else ft.partial(layered, behind=self.behind)
+        return draw(self.image, self.depth, lens, max_coc=self.max_coc, **options)
 
     def with_room(self, values: _Unknowns) -> "_Model":
         """The model that draws the circles of these values and still larger ones."""
         room = _ROOM * largest_coc("dof", self.depth, self.lens(values))
-        return _Model(self.image, self.depth, self.focal_pixels, self.start, room)
+        return dataclasses.replace(self, max_coc=room)
 
     def clamped(self, values: _Unknowns) -> Float[Array, ""]:
         """The share of pixels whose circles it can't draw in full."""

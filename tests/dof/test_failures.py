@@ -9,11 +9,19 @@ import json
 import pathlib
 
 import dof_cases
+import numpy as np
 import pytest
+
+from jaxfx import FocusPlanes, ThinLens
 
 
 PUBLISHED = json.loads((pathlib.Path(__file__).parent / "failures.json").read_text())
 METHODS = dof_cases.methods()
+
+CASES = [
+    (ThinLens(0.2, 2.5, 60.0), (13, 11)),
+    (FocusPlanes(near=1.0, focus=2.5, far=7.0, max_coc=6.0), (1, 17)),
+]
 
 # What the page asks of every method, whatever else it gets wrong.
 NEVER = ("constant", "energy", "not finite")
@@ -44,6 +52,15 @@ def test_no_method_is_worse_than_published(name):
 def test_what_no_method_may_get_wrong(name):
     wrong = {case: figures(name)[case] for case in NEVER}
     assert all(figure <= dof_cases.PASSES[case] for case, figure in wrong.items()), wrong
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(("lens", "size"), CASES, ids=["thin lens", "focus planes"])
+def test_a_constant_image_is_kept_to_rounding(name, lens, size):
+    depth = np.random.default_rng(0).uniform(0.5, 9, size)
+    depth[..., :2], depth[-1, -1] = np.inf, 1e-30
+    out = METHODS[name](np.full((*size, 2), 0.7), depth, lens, max_coc=6.0)
+    assert np.abs(out - 0.7).max() < 1e-12
 
 
 def test_the_reference_passes_where_it_is_one():

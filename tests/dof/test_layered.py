@@ -9,6 +9,7 @@ import pytest
 
 from jaxfx import FocusPlanes, ThinLens, dof, metrics, relight, scene
 from jaxfx.dof import _sheets
+from jaxfx.scene import _embree, _opengl
 
 
 # A lens for which the depths 1, 2 and inf are of defocus -12, 0 and 12 pixels.
@@ -235,36 +236,54 @@ def test_faults_are_named():
 
 @pytest.fixture(scope="module")
 def still_life():
-    """Renders of the still life, its first two layers, and a lens focused behind the rods."""
+    """Renders of the still life, its depth, and a lens focused behind the rods."""
     side = 96
     mesh = scene.still_life()
     camera = scene.default_camera(mesh, height=side, width=side)
     lights = scene.default_lights(camera)
     shade = jax.jit(relight.render)
 
-    def buffer(camera, layer=0):
-        return scene.gbuffer(mesh, camera, height=side, width=side, layer=layer)
+    def buffer(camera, layer=0, backend="auto"):
+        return scene.gbuffer(
+            mesh, camera, height=side, width=side, layer=layer, backend=backend
+        )
 
     def passes(aperture, samples):
         lens = ThinLens.from_camera(camera, aperture=aperture, focus_distance=4.0)
         render = lambda camera: shade(buffer(camera), camera, lights)
         return lens, dof.accumulate(render, camera, lens, samples=samples, progress=False).image
 
-    first, second = buffer(camera), buffer(camera, 1)
-    behind = shade(second, camera, lights), second.depth
+    def behind(backend):
+        second = buffer(camera, 1, backend)
+        return shade(second, camera, lights), second.depth
+
     lens, reference = passes(0.055, 96)
-    return passes(0.0, 16)[1], first.depth, behind, lens, reference
+    return passes(0.0, 16)[1], buffer(camera).depth, behind, lens, reference
 
 
-def test_better_than_scatter_on_the_still_life(still_life):
-    image, depth, behind, lens, reference = still_life
-    score = lambda picture: float(metrics.psnr(picture, reference))
-    scatter = max(
-        score(dof.scatter(image, depth, lens, gamma=gamma, epsilon=epsilon, max_coc=8.0))
+def score(still_life, method, **options):
+    image, depth, _, lens, reference = still_life
+    return float(metrics.psnr(method(image, depth, lens, max_coc=8.0, **options), reference))
+
+
+@pytest.fixture(scope="module")
+def scatter_score(still_life):
+    """Of the best fitted scatter."""
+    return max(
+        score(still_life, dof.scatter, gamma=gamma, epsilon=epsilon)
         for gamma in (0.0, 1.0, 4.0)
         for epsilon in (1.0, 2.0, 4.0, 8.0)
     )
-    one = score(dof.layered(image, depth, lens, max_coc=8.0))
-    two = score(dof.layered(image, depth, lens, max_coc=8.0, behind=behind))
-    assert one > scatter
-    assert two > scatter + 2.5
+
+
+def test_one_layer_is_better_than_scatter_on_the_still_life(still_life, scatter_score):
+    assert score(still_life, dof.layered) > scatter_score
+
+
+@pytest.mark.parametrize("backend", ["embree", "opengl"])
+def test_two_layers_are_better_by_far(still_life, scatter_score, backend):
+    problem = {"embree": _embree, "opengl": _opengl}[backend].problem()
+    if problem:
+        pytest.skip(f"the second layer can't be drawn here by {backend}: {problem}")
+    behind = still_life[2](backend)
+    assert score(still_life, dof.layered, behind=behind) > scatter_score + 2.5

@@ -89,6 +89,24 @@ def test_recovers_what_made_the_picture(sides, dtype):
     assert len(fitted.losses) < 80
 
 
+def test_the_threshold_of_layered_scatter_is_found():
+    image, depth = still_life(16)
+    lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 40.0)
+    behind = image[::-1], np.full_like(depth, 20.0)
+    draw = functools.partial(dof.layered, image, depth, max_coc=4.0, behind=behind)
+    fitted = fit.dof(
+        *(draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)),
+        method="layered",
+        threshold=2.0,
+        behind=behind,
+        max_coc=4.0,
+        progress=False,
+    )
+    values = fitted.lens.aperture, fitted.lens.focus_distance, fitted.threshold
+    np.testing.assert_allclose(values, (0.12, 3.0, 1.2), rtol=0.01)
+    assert set(fitted.uncertainty) == set(fit.LAYERED_PARAMETERS)
+
+
 def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
     reference, image, depth = picture()
     start = dof.scatter(image, depth, **options(wrong((1, 1, 1, 1))))
@@ -212,6 +230,12 @@ FAULTS = {
     "dof(epsilon=...)": {"epsilon": np.zeros(2)},
     "dof(parameters=...)": {"parameters": ("aperture", "focal_pixels")},
     "dof(parameters=...) must name some": {"parameters": ()},
+    "dof(parameters=...) must name some of ('aperture', 'focus_distance', 'threshold')": {
+        "method": "layered",
+        "parameters": ("gamma",),
+    },
+    "dof(method=...)": {"method": "gather"},
+    "dof(threshold=...)": {"threshold": -1.0},
     "dof(max_steps=...)": {"max_steps": 0},
     "scatter(max_coc=...)": {"max_coc": -1},
 }
