@@ -16,7 +16,7 @@ from jaxfx.shadow.receivers import Receivers
 Texels = Float[Array, "texels_down texels_across"]
 
 # Smaller filters are read tap by tap.
-_LEAST_WINDOW = 5
+_LEAST_WINDOW = 7
 
 
 def hard(
