@@ -6,13 +6,15 @@
 
 import argparse
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 import relight_truth as truth
 from matplotlib import pyplot as plt
+from PIL import Image
 
-from jaxfx import Transfer, exr, metrics, relight, scene, tradeoff
+from jaxfx import Transfer, exr, metrics, relight, scene
 
 
 SIZE = (72, 96)
@@ -24,6 +26,13 @@ def shown(ax, title, image):
     ax.imshow(exr.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
     ax.set_title(title, fontsize=9)
     ax.set_axis_off()
+
+
+def save(figure, path):
+    """As a picture of 128 colours, which is small."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=120)
+    Image.open(stream).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path)
 
 
 def direct(mesh, camera, gbuffer, path):
@@ -45,7 +54,7 @@ def direct(mesh, camera, gbuffer, path):
         shown(row[0], f"Mitsuba, {name}", traced / 2)
         shown(row[1], f"relit, {how}: {score:.1f} dB", image / 2)
         shown(row[2], f"error; {off:.1%} of the pixels", np.abs(image - traced) / 2)
-    tradeoff.save(figure, path)
+    save(figure, path)
 
 
 def bounce(mesh, camera, gbuffer, path):
@@ -83,7 +92,7 @@ def bounce(mesh, camera, gbuffer, path):
     ax.set_title("to the path tracer; dotted: to the full matrix", fontsize=9)
     ax.legend(fontsize=8)
     ax.grid(alpha=0.3)
-    tradeoff.save(figure, path)
+    save(figure, path)
     print(f"noise {size(noise) / size(traced):.3f}")
     return rows
 

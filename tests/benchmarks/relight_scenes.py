@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxfx import PinholeCamera, PointLight, relight, scene
 from jaxfx._sampling import pixel_centers
+from jaxfx.scene._embree import _accelerated
 
 
 @functools.cache
@@ -57,19 +58,31 @@ def new_view(size, count):
     return target, render(target).depth, [render(camera) for camera in cameras], cameras
 
 
-def unshadowed(mesh, gbuffer, camera, light):
-    """1 where nothing stands between a pixel's surface and a point light, by a ray for each."""
-    height, width = gbuffer.depth.shape
-    depth = jnp.where(jnp.isfinite(gbuffer.depth), gbuffer.depth, 1)
+def shadow_starts(mesh, gbuffer, camera):
+    """Where each pixel's shadow rays start, in the unit ball that Embree has the mesh in."""
+    depth = gbuffer.depth
+    height, width = depth.shape
     points = camera.unproject(pixel_centers(height, width, depth.dtype), depth)
-    return scene.visible(mesh, points, np.asarray(light.position)).astype(jnp.float32)
+    start = (np.asarray(points) - mesh.centre) / mesh.scale + 1e-3 * np.asarray(gbuffer.normal)
+    return np.where(np.isfinite(start), start, 0).reshape(-1, 3).astype(np.float32)
+
+
+def unshadowed(mesh, start, light):
+    """1 where nothing stands between a start and a point light, by one ray for each."""
+    end = (np.asarray(light.position) - mesh.centre) / mesh.scale
+    reach = np.ones(len(start), np.float32)
+    hit = _accelerated(mesh).run(
+        start, end.astype(np.float32) - start, dists=reach, query="OCCLUDED"
+    )
+    return hit < 0
 
 
 def rendered_anew(mesh, camera, lights, size):
     """The picture with shadows, from the mesh: nothing is kept."""
     gbuffer = scene.gbuffer(mesh, camera, height=size[0], width=size[1], backend="embree")
+    start = shadow_starts(mesh, gbuffer, camera)
     image = jnp.zeros((*size, 3), jnp.float32)
     for light in lights:
-        visible = unshadowed(mesh, gbuffer, camera, light)
-        image = image + relight.shade(gbuffer, camera, light, visible)
+        visible = unshadowed(mesh, start, light).reshape(size)
+        image = image + relight.shade(gbuffer, camera, light, visible.astype(np.float32))
     return image

@@ -398,7 +398,11 @@ def test_what_is_rendered_anew_is_what_is_edited():
     lights = relight_scenes.lights(2)
     image = relight_scenes.rendered_anew(mesh, camera, lights, (24, 32))
     gbuffer = scene.gbuffer(mesh, camera, height=24, width=32, backend="embree")
-    visible = [relight_scenes.unshadowed(mesh, gbuffer, camera, light) for light in lights]
+    starts = relight_scenes.shadow_starts(mesh, gbuffer, camera)
+    visible = [
+        jnp.asarray(relight_scenes.unshadowed(mesh, starts, light).reshape(24, 32), jnp.float32)
+        for light in lights
+    ]
     assert 0.05 < float(jnp.mean(jnp.stack(visible))) < 0.99
     state = relight.start(gbuffer, camera, lights, visibilities=[None, visible[1]])
     state = state.edit(0, lights[0], visible[0])
