@@ -13,8 +13,12 @@ def _held(place, node, level):
 
 
 @numba.njit(parallel=True, cache=True)
-def _walk(values, offsets, columns, size, origins, directions, times, steps):
-    """Each ray alone, in scalar code, as one would write it in C. Rays start inside."""
+def _walk(values, offsets, columns, size, thickness, origins, directions, times, steps):
+    """Each ray alone, in scalar code, as one would write it in C. Rays start inside.
+
+    After the root they begin where ours do: the steps are the same, and what is compared is how
+    long they take.
+    """
     never = np.float32(np.inf)
     one, top = np.float32(1), len(offsets) - 1
     for ray in numba.prange(len(origins)):
@@ -46,6 +50,9 @@ def _walk(values, offsets, columns, size, origins, directions, times, steps):
                     x = _held(ox + time * dx, node_x, level)
                     y = _held(oy + time * dy, node_y, level)
                 level -= 1
+                if count == 1 and dz > 0:
+                    way = thickness / dz * max(abs(dx), abs(dy))
+                    level = min(level, math.ceil(math.log2(max(way / 4, 1))))
                 continue
             if leave == never:
                 break
@@ -75,5 +82,7 @@ def walk(pyramid, origins, directions):
     columns = np.array([shape[1] for shape in pyramid.shapes])
     offsets, size = np.array(pyramid.offsets), np.array(pyramid.shapes[0])
     values = np.asarray(pyramid.values)
-    _walk(values, offsets, columns, size, origins, directions, times, steps)
+    depth = values[: size[0] * size[1]]
+    thickness = depth.max() - values[-1]
+    _walk(values, offsets, columns, size, thickness, origins, directions, times, steps)
     return times, steps

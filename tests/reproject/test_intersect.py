@@ -9,15 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reproject_cases import cliff, error_rate, posts, run, slanted_rays, smooth
 
 from jaxfx.reproject import intersect
 
 
 SIZES = [(1, 1), (2, 3), (5, 5), (17, 61), (64, 64), (257, 64)]
-run = jax.jit(
-    intersect,
-    static_argnames=("method", "max_steps", "surface"),
-)
 METHODS = ("pyramid", "descent", "linear", "relief")
 
 
@@ -187,47 +184,7 @@ def test_a_bound_on_steps_is_kept_and_said():
     np.testing.assert_array_equal(hit.mask[within], free.mask[within])
 
 
-# Where the methods fail. Rays at a slant over a field, `slope` texels to each tenth of depth.
-
-
-def slanted_rays(size, slope):
-    y, x = np.mgrid[:size, :size] + 0.5
-    origin = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    direction = np.array([np.cos(0.4), np.sin(0.4), 0.1 / max(slope, 1e-9)])
-    if slope == 0:
-        direction = np.array([0, 0, 1.0])
-    back = 0.35 / direction[2] * direction
-    return origin - back * (1, 1, 0), np.broadcast_to(direction, origin.shape)
-
-
-def smooth(size):
-    y, x = np.mgrid[:size, :size] / size
-    return 0.6 + 0.1 * np.sin(9 * x) * np.cos(7 * y)
-
-
-def posts(size):
-    """One-texel posts and one-texel gaps."""
-    depth = np.full((size, size), 0.7)
-    depth[4::9, 4::9] = 0.3
-    depth[:, size // 2 :] = 0.4
-    depth[4::9, size // 2 + 4 :: 9] = 0.7
-    return depth
-
-
-def cliff(size):
-    depth = np.full((size, size), 0.8)
-    depth[:, size // 2 :] = 0.3
-    return depth
-
-
-def error_rate(depth, slope, method, max_steps=None):
-    """The share of rays whose mask is wrong or whose hit is over a texel off."""
-    origin, direction = slanted_rays(len(depth), slope)
-    exact = run(depth, origin, direction)
-    hit = run(depth, origin, direction, method=method, max_steps=max_steps)
-    off = np.abs(np.asarray(hit.position - exact.position))[:, :2].max(axis=1) > 1
-    wrong = np.asarray(hit.mask != exact.mask) | (off & np.asarray(exact.mask))
-    return float(wrong.mean())
+# Where the methods fail: the fields of the chart.
 
 
 @pytest.mark.parametrize("make", [smooth, posts, cliff])
