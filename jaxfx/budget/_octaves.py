@@ -1,0 +1,101 @@
+"""Scatter with large sprites at a lower resolution: a large disc has no detail to lose."""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxfx._numerics import clip01, working_dtype
+from jaxfx.dof._shift import shift
+from jaxfx.dof._spans import spans
+from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
+from jaxfx.dof._tiles import tiles
+from jaxfx.dof.scatter import cheapest, to_sprites
+from jaxfx.lens import FocusPlanes, ThinLens
+
+
+EPSILON = 2.0
+_KERNELS = {"shift": shift, "tiles": tiles, "spans": spans}
+_Values = Float[Array, "height width value"]
+
+
+@ft.partial(jax.jit, static_argnames=("max_coc", "split"))
+def octaves(
+    image: Float[Array, "height width channel"],
+    depth: Float[Array, "height width"],
+    lens: ThinLens | FocusPlanes,
+    max_coc: float,
+    split: float,
+) -> Float[Array, "height width channel"]:
+    """`dof.scatter`, but of sprites wider than `split` four make one, of half the size; again
+    and again, until none is.
+
+    What they add, in front of the focus and behind it apart, is enlarged again before the
+    quotient is taken; how much of the latter a pixel takes is its own to say, at full size: for
+    sprites of three times epsilon and more, the leak rejection is a factor of the destination.
+    """
+    dtype = image.dtype
+    image, depth = (x.astype(working_dtype(dtype)) for x in (image, depth))
+    gamma, epsilon = jnp.zeros((), image.dtype), jnp.asarray(EPSILON, image.dtype)
+    sprites = to_sprites(image, depth, lens, gamma, epsilon, max_coc)
+
+    large = sprites.radius > split / 2
+    sums = _painted(_without(sprites, large), split)
+    is_front = large & (sprites.leak < 0)
+    parts = (is_front, large & ~is_front)
+    planes = [jnp.where(part[..., None], sprites.value, 0) for part in parts]
+    coarse = _coarse(jnp.concatenate(planes, axis=-1), sprites.radius, large, max_coc, split)
+    front, back = jnp.split(_enlarged(coarse, depth.shape), 2, axis=-1)
+    passed = clip01(sprites.coc / EPSILON - 1)[..., None]
+    sums = sums + front + passed * back
+    return (sums[..., :-1] / sums[..., -1:]).astype(dtype)
+
+
+def _coarse(
+    value: _Values,
+    radius: Float[Array, "height width"],
+    large: Bool[Array, "height width"],
+    max_coc: float,
+    split: float,
+) -> Float[Array, "rows columns value"]:
+    """What the large sprites add, at half the resolution, the larger ones at less."""
+    share = large[..., None].astype(value.dtype)
+    pooled = _pooled(jnp.concatenate([value, share * radius[..., None], share], axis=-1))
+    count, max_coc = pooled[..., -1], max_coc / 2
+    radius = jnp.where(count > 0, pooled[..., -2] / jnp.maximum(count, 1) / 2, POINT_RADIUS)
+    none = jnp.zeros_like(radius)
+    sprites = Sprites(pooled[..., :-2], radius, none - 1, none, jnp.ones((), radius.dtype))
+    if max_coc <= split:
+        return _painted(sprites, max_coc)
+    large = radius > split / 2
+    value = jnp.where(large[..., None], sprites.value, 0)
+    coarser = _coarse(value, radius, large, max_coc, split)
+    return _painted(_without(sprites, large), split) + _enlarged(coarser, radius.shape)
+
+
+def _without(sprites: Sprites, some: Array) -> Sprites:
+    """The other sprites."""
+    value = jnp.where(some[..., None], 0, sprites.value)
+    return sprites._replace(value=value, radius=jnp.where(some, POINT_RADIUS, sprites.radius))
+
+
+def _painted(sprites: Sprites, max_coc: float) -> _Values:
+    height, width = sprites.radius.shape
+    kernel = cheapest(height, width, max_coc)
+    return _KERNELS[kernel](sprites, reach(max_coc))
+
+
+def _pooled(planes: _Values) -> Float[Array, "rows columns value"]:
+    """The sums over blocks of 2 x 2 pixels."""
+    height, width, count = planes.shape
+    planes = jnp.pad(planes, ((0, height % 2), (0, width % 2), (0, 0)))
+    blocks = planes.reshape((height + 1) // 2, 2, (width + 1) // 2, 2, count)
+    return blocks.sum(axis=(1, 3))
+
+
+def _enlarged(planes: Float[Array, "rows columns value"], shape: tuple[int, ...]) -> _Values:
+    """Twice the size, between pixels linearly; cut to `shape`."""
+    rows, columns, count = planes.shape
+    larger = jax.image.resize(planes, (2 * rows, 2 * columns, count), "linear")
+    return larger[: shape[0], : shape[1]]

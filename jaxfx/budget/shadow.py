@@ -1,0 +1,103 @@
+"""Shadows within an error."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfx._numerics import parameter
+from jaxfx.budget._plan import Plan, Recipe, Trial, check_call, plan, quickest, timed, tried
+from jaxfx.shadow.edge import candidates, edge_pcf
+from jaxfx.shadow.pcf import hard
+from jaxfx.shadow.receivers import Receivers
+
+
+class Hard(eqx.Module):
+    """`shadow.hard`."""
+
+    bias: Float[Array, ""]
+    slope_bias: Float[Array, ""]
+    title: ClassVar[str] = "hard shadow"
+
+    def __call__(self, shadow_map: Any, receivers: Any) -> Any:
+        """As the effect."""
+        return hard(shadow_map, receivers, bias=self.bias, slope_bias=self.slope_bias)
+
+
+class Edge(eqx.Module):
+    """`shadow.edge_pcf` with the mask by depth, which is `shadow.pcf` of its size exactly."""
+
+    bias: Float[Array, ""]
+    slope_bias: Float[Array, ""]
+    size: int = eqx.field(static=True)
+    title: ClassVar[str] = "shadow filtered where its edges are"
+
+    def __call__(self, shadow_map: Any, receivers: Any) -> Any:
+        """As the effect."""
+        return edge_pcf(
+            shadow_map,
+            receivers,
+            size=self.size,
+            bias=self.bias,
+            slope_bias=self.slope_bias,
+            mask="depth",
+        )
+
+
+def shadow(
+    shadow_map: Float[ArrayLike, "rows columns"],
+    receivers: Receivers,
+    *,
+    size: int,
+    bias: Float[ArrayLike, ""] | float = 0.0,
+    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    max_error: int | float,
+) -> Plan:
+    """The quickest shadow within an error of `shadow.pcf` with a filter of `size`.
+
+    Outside the mask by depth the hard shadow is the filtered one, inside it differs by less
+    than 1: where the square root of the mask's share is within the error, the hard shadow is
+    taken and nothing else is tried. Else smaller filters are tried on this scene, all of them
+    at work inside the mask alone, which costs no error.
+
+    **Arguments:**
+
+    - `shadow_map`, `receivers`: height width, as in `shadow.pcf`.
+    - `size`: static; odd, in texels, of the full filter.
+    - `bias`, `slope_bias`: scene units and texels, as in `shadow.pcf`.
+    - `max_error`: root mean square of the visibility, a ratio, over all pixels.
+
+    **Returns:** a `Plan`, to be called with `shadow_map, receivers`.
+
+    **Raises:** `ValueError` as `shadow.pcf`, for a negative `max_error` or traced data.
+
+    **Gradient:** none through the choice; the plan's shadow has that of what it draws.
+    """
+    max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
+    biases = (
+        parameter("shadow(bias=...)", bias),
+        parameter("shadow(slope_bias=...)", slope_bias),
+    )
+    where = candidates(
+        shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1], mask="depth"
+    ).where
+    share = float(jnp.mean(where))
+    text = "the filter"
+    data = (shadow_map, receivers)
+    if share**0.5 <= max_error:
+        why = f"it can't matter in more than {share:.2%} of the pixels."
+        seconds = timed(Hard(*biases), data)[1]
+        return plan(Hard(*biases), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
+    exact = Edge(*biases, size)
+    reference, seconds = timed(exact, data)
+    outside = f"the filter outside of the {share:.1%} of the pixels where it matters"
+    trials = [Trial(Recipe(exact, outside), 0.0, seconds)]
+    for smaller in range(1, size, 2):
+        call = Hard(*biases) if smaller == 1 else Edge(*biases, smaller)
+        less = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
+        trials.append(tried(Recipe(call, less), data, reference, max_error))
+        if trials[-1].error <= max_error:
+            break
+    return quickest(trials, max_error, seconds)

@@ -1,0 +1,134 @@
+"""Plans for depth of field: they hold what they promise, and say what they leave out."""
+
+import inspect
+import statistics
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx import FocusPlanes, ThinLens, budget, dof
+from jaxfx.budget.dof import Octaves
+
+
+SIZE = (20, 24)
+
+
+def scene(rng, widest):
+    """Cards at random depths before a wall, and the lens whose largest circle is `widest`."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    image = rng.uniform(0, 1) * rng.uniform(0, 1, (*SIZE, 3)) + rng.uniform(0, 0.5, 3)
+    depth = np.full(SIZE, rng.uniform(3, 9))
+    for _ in range(rng.integers(0, 5)):
+        cx, cy, side = rng.uniform(0, SIZE[1]), rng.uniform(0, SIZE[0]), rng.uniform(2, 8)
+        card = (abs(x - cx) < side) & (abs(y - cy) < side)
+        depth[card], image[card] = rng.uniform(1, 6), rng.uniform(0, 1, 3)
+    lens = ThinLens(1.0, rng.uniform(1.5, 5), 1.0)
+    largest = float(lens.circle_of_confusion(jnp.asarray(depth)).max())
+    lens = eqx.tree_at(lambda lens: lens.aperture, lens, jnp.asarray(widest / largest))
+    return jnp.asarray(image), jnp.asarray(depth), lens
+
+
+def rms(difference):
+    return float(np.sqrt(np.mean(np.square(difference))))
+
+
+@pytest.fixture(scope="module")
+def plans():
+    """200 random scenes, their plans, and the errors that these make."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        widest = rng.choice([0.9, 3.9, 13.9])
+        max_error = 10 ** rng.uniform(-3, -1)
+        data = scene(rng, widest)
+        plan = budget.dof(*data, max_error=max_error)
+        full = dof.scatter(*data, max_coc={0.9: 1.0, 3.9: 4.0, 13.9: 14.0}[widest])
+        found.append((plan, max_error, rms(plan(*data) - full)))
+    return found
+
+
+def test_no_plan_exceeds_its_error(plans):
+    for plan, max_error, error in plans:
+        assert error <= max_error
+        assert error == pytest.approx(float(plan.predicted_error), rel=1e-6, abs=1e-12)
+
+
+def test_the_error_allowed_is_made_use_of(plans):
+    slack = [max_error / error for _, max_error, error in plans if error > 0]
+    assert len(slack) > 60
+    assert statistics.median(slack) < 4
+
+
+def test_plans_differ_with_scenes_and_say_why(plans):
+    titles = {str(plan).split(":")[0] for plan, _, _ in plans}
+    assert len(titles) >= 3, titles
+    for plan, _, error in plans:
+        assert (error > 0) <= (len(plan.left_out) > 0)
+        assert "error" in str(plan)
+
+
+def test_nothing_is_done_where_no_circle_passes_its_pixel():
+    image, depth, lens = scene(np.random.default_rng(1), 0.9)
+    plan = budget.dof(image, depth, lens, max_error=0)
+    assert "no circle of confusion passes its pixel" in str(plan)
+    np.testing.assert_array_equal(plan(image, depth, lens), image)
+
+
+def test_no_error_allowed_is_the_effect_itself():
+    data = scene(np.random.default_rng(2), 13.9)
+    plan = budget.dof(*data, max_error=0)
+    assert plan.predicted_error == 0
+    np.testing.assert_array_equal(plan(*data), dof.scatter(*data, max_coc=14.0))
+
+
+def test_a_flat_picture_of_large_circles_stays_flat_in_octaves():
+    """A constant is kept by any quotient of two sums; an odd size has no block to lose."""
+    image, depth = jnp.full((*SIZE, 1), 0.7)[1:, 1:], jnp.full(SIZE, 4.0)[1:, 1:]
+    lens = FocusPlanes(1.0, 2.0, 3.0, 13.9)
+    np.testing.assert_allclose(Octaves(14.0, 8.0)(image, depth, lens), 0.7, rtol=1e-9)
+
+
+def test_octaves_keep_the_energy_of_a_highlight_and_its_place():
+    image, depth = jnp.zeros((36, 40, 1)).at[18, 20].set(100.0), jnp.full((36, 40), 4.0)
+    lens = FocusPlanes(1.0, 2.0, 3.0, 13.9)
+    blurred = Octaves(14.0, 8.0)(image, depth, lens)[..., 0]
+    y, x = np.mgrid[:36, :40] + 0.5
+    assert blurred.sum() == pytest.approx(100, rel=0.02)
+    # The highlight's own centre, but for its block of four's: half a pixel.
+    centre = [float((blurred * axis).sum() / blurred.sum()) for axis in (y, x)]
+    np.testing.assert_allclose(centre, [19, 21], atol=0.05)
+
+
+def test_a_plan_is_a_pytree_and_its_picture_has_a_gradient():
+    data = scene(np.random.default_rng(3), 13.9)
+    plan = budget.dof(*data, max_error=0.05)
+    leaves, structure = jax.tree.flatten(plan)
+    again = jax.tree.unflatten(structure, leaves)
+    aperture = lambda a: ThinLens(a, data[2].focus_distance, data[2].focal_pixels)
+    energy = lambda a: jnp.sum(again(data[0], data[1], aperture(a)) ** 2)
+    start = 0.7 * data[2].aperture
+    slope = (energy(start + 1e-5) - energy(start - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(energy)(start), slope, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_error": -1}, r"`dof\(max_error=...\)` must be a number, 0 or positive, got -1"),
+        ({"max_error": 1, "target": "x"}, r"`dof\(target=...\)` must be \"scatter\" or"),
+    ],
+)
+def test_a_wrong_argument_is_refused(options, message):
+    data = scene(np.random.default_rng(3), 13.9)
+    with pytest.raises(ValueError, match=message):
+        inspect.unwrap(budget.dof)(*data, **options)
+
+
+def test_a_plan_is_made_outside_of_transforms():
+    image, depth, lens = scene(np.random.default_rng(3), 13.9)
+    with pytest.raises(ValueError, match="must be given concrete data"):
+        jax.jit(lambda image: budget.dof(image, depth, lens, max_error=1.0).predicted_error)(
+            image
+        )

@@ -1,0 +1,61 @@
+"""Plans for shadows."""
+
+import inspect
+import statistics
+
+import numpy as np
+import pytest
+
+from jaxfx import budget, shadow
+
+
+def scene(rng):
+    """Cards over a floor, which receivers see from anywhere."""
+    y, x = np.mgrid[:24, :24] + 0.5
+    shadow_map = np.full((24, 24), 5.0)
+    for _ in range(rng.integers(0, 4)):
+        cx, cy, side = *rng.uniform(0, 24, 2), rng.uniform(0.5, 7)
+        shadow_map[(abs(x - cx) < side) & (abs(y - cy) < side)] = rng.uniform(1, 4)
+    u, v = (
+        rng.uniform(2, 22) + rng.uniform(0.05, 0.8) * (side[:16, :16] - 8) for side in (x, y)
+    )
+    return shadow_map, shadow.Receivers(*map(np.asarray, (u, v, 5 + 0 * u, 0 * u)))
+
+
+@pytest.fixture(scope="module")
+def plans():
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        data, max_error = scene(rng), 10 ** rng.uniform(-2, -0.5)
+        plan = budget.shadow(*data, size=5, bias=0.1, max_error=max_error)
+        full = shadow.pcf(*data, size=5, bias=0.1)
+        error = float(np.sqrt(np.mean((plan(*data) - full) ** 2)))
+        found.append((plan, max_error, error))
+    return found
+
+
+def test_no_plan_exceeds_its_error(plans):
+    for plan, max_error, error in plans:
+        assert error <= float(plan.predicted_error) + 1e-12 <= max_error + 2e-12
+
+
+def test_the_error_allowed_is_made_use_of(plans):
+    slack = [max_error / error for _, max_error, error in plans if error > 0]
+    assert len(slack) > 20
+    assert statistics.median(slack) < 4
+
+
+def test_plans_differ_with_scenes_and_say_why(plans):
+    texts = [str(plan) for plan, _, _ in plans]
+    for part in (
+        "it can't matter in more than",
+        "outside of the",
+        "a filter larger than 3 x 3",
+    ):
+        assert any(part in text for text in texts), part
+
+
+def test_a_negative_error_is_refused():
+    data = scene(np.random.default_rng(0))
+    with pytest.raises(ValueError, match=r"`shadow\(max_error=...\)` must be a number"):
+        inspect.unwrap(budget.shadow)(*data, size=3, max_error=-1)
