@@ -21,9 +21,10 @@ def load(path: str | os.PathLike[str]) -> Scene:
 
     Anything that trimesh reads: OBJ, PLY, GLB, STL and more. Pictures and the colours of OBJ
     and PLY files are taken to be sRGB; glTF's factors and vertex colours are linear, as its
-    standard says (trimesh rounds a factor to 1/255). Alpha, occlusion, emission and
-    OBJ's bump maps are left out. An OBJ material's exponent Ns becomes the roughness
-    sqrt(2 / (Ns + 2)), and 1 where its Ks is black.
+    standard says (trimesh rounds a factor to 1/255). Alpha, occlusion and emission are left
+    out; so are OBJ's bump maps, whose heights have no unit there, and the `scale` of glTF's
+    normal maps, of which trimesh keeps the picture alone: it counts as 1. An OBJ material's
+    exponent Ns becomes the roughness sqrt(2 / (Ns + 2)), and 1 where its Ks is black.
 
     **Arguments:** `path`: the file.
 

@@ -3,6 +3,7 @@
 import functools
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -59,16 +60,14 @@ def gbuffer(
     **Gradient:** none, with respect to the camera or anything else: this runs on the host,
     outside every transform.
     """
-    height, width = check_size("gbuffer", height, width)
-    view = View.of(camera, "scene.gbuffer")
-    hits = _visible("gbuffer", scene, view, height, width, backend, layer)
+    view, hits, size = _visible("gbuffer", scene, camera, height, width, backend, layer)
     if layer == 0 and len(hits.pixel) == 0:
         raise ValueError(
             "`scene.gbuffer(camera)` must see the scene, got nothing in view: the scene lies "
             f"about {np.round(scene.centre, 3).tolist()}, "
             f"{np.round(scene.extent, 3).tolist()} in size."
         )
-    return to_gbuffer(scene, view, hits, height, width)
+    return to_gbuffer(scene, view, hits, *size)
 
 
 def depth(
@@ -90,10 +89,8 @@ def depth(
 
     **Gradient:** none: this runs on the host, outside every transform.
     """
-    height, width = check_size("depth", height, width)
-    view = View.of(camera, "scene.depth")
-    hits = _visible("depth", scene, view, height, width, backend, layer)
-    return jnp.asarray(depth_image(hits, height, width))
+    _, hits, size = _visible("depth", scene, camera, height, width, backend, layer)
+    return jnp.asarray(depth_image(hits, *size))
 
 
 def object_ids(
@@ -115,10 +112,8 @@ def object_ids(
 
     **Gradient:** none: these are integers.
     """
-    height, width = check_size("object_ids", height, width)
-    view = View.of(camera, "scene.object_ids")
-    hits = _visible("object_ids", scene, view, height, width, backend, layer)
-    return _ids(hits, scene.face_objects, height, width)
+    _, hits, size = _visible("object_ids", scene, camera, height, width, backend, layer)
+    return _ids(hits, scene.face_objects, size)
 
 
 def material_ids(
@@ -140,24 +135,24 @@ def material_ids(
 
     **Gradient:** none: these are integers.
     """
-    height, width = check_size("material_ids", height, width)
-    view = View.of(camera, "scene.material_ids")
-    hits = _visible("material_ids", scene, view, height, width, backend, layer)
-    return _ids(hits, scene.face_materials, height, width)
+    _, hits, size = _visible("material_ids", scene, camera, height, width, backend, layer)
+    return _ids(hits, scene.face_materials, size)
 
 
 def _ids(
-    hits: Hits, of_face: Int[np.ndarray, " face"], height: int, width: int
+    hits: Hits, of_face: Int[np.ndarray, " face"], size: tuple[int, int]
 ) -> Int[Array, "height width"]:
-    ids = np.full(height * width, -1, np.int32)
-    ids[hits.pixel] = of_face[hits.face]
-    return jnp.asarray(ids.reshape(height, width))
+    ids = np.full(size, -1, np.int32)
+    ids.flat[hits.pixel] = of_face[hits.face]
+    return jnp.asarray(ids)
 
 
 def _visible(
-    caller: str, scene: Scene, view: View, height: int, width: int, backend: str, layer: int
-) -> Hits:
-    """What the camera sees of layer `layer`."""
+    caller: str, scene: Any, camera: Any, height: Any, width: Any, backend: Any, layer: Any
+) -> tuple[View, Hits, tuple[int, int]]:
+    """The camera, what it sees of layer `layer`, and the picture's size."""
+    height, width = check_size(caller, height, width)
+    view = View.of(camera, f"scene.{caller}")
     if not isinstance(scene, Scene):
         raise ValueError(
             f"`scene.{caller}(scene)` must be a Scene, got {type(scene).__name__}."
@@ -171,7 +166,7 @@ def _visible(
     for _ in range(layer):
         faces = _next_faces(first_faces, scene, view, hits, (height, width))
         hits = intersect(scene, view, faces)
-    return hits
+    return view, hits, (height, width)
 
 
 def _next_faces(

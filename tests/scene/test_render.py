@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from jaxfx import PinholeCamera, scene
-from jaxfx.scene import _render, _view
+from jaxfx.scene import _view
 
 
 SIZE = {"height": 20, "width": 30}
@@ -89,7 +89,7 @@ def test_bad_scenes_and_cameras(ball, view, monkeypatch):
     with pytest.raises(ValueError, match=r"scene\.depth\(camera\)` must be a PinholeCamera"):
         of(_view.View, "camera", "scene.depth")
     with pytest.raises(ValueError, match=r"scene\.depth\(scene\)` must be a Scene, got str"):
-        inspect.unwrap(_render._visible)("depth", "x", None, 9, 9, "auto", 0)
+        inspect.unwrap(scene.depth)("x", view, **SIZE)
     broken = PinholeCamera(view.intrinsics.at[0, 0].set(np.nan), view.world_from_camera)
     with pytest.raises(ValueError, match="must be finite"):
         scene.depth(ball, broken, **SIZE)
