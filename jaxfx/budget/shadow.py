@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxfx._numerics import parameter
 from jaxfx.budget._plan import Plan, Recipe, Trial, check_call, plan, quickest, timed, tried
 from jaxfx.shadow.edge import candidates, edge_pcf
-from jaxfx.shadow.pcf import hard
+from jaxfx.shadow.pcf import hard, pcf
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -90,7 +90,8 @@ def shadow(
         why = f"it can't matter in more than {share:.2%} of the pixels."
         seconds = timed(Hard(*biases), data)[1]
         return plan(Hard(*biases), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
-    exact = Edge(*biases, size)
+    everywhere = lambda *data: pcf(*data, size=size, bias=biases[0], slope_bias=biases[1])
+    exact, full = Edge(*biases, size), timed(everywhere, data)[1]
     reference, seconds = timed(exact, data)
     outside = f"the filter outside of the {share:.1%} of the pixels where it matters"
     trials = [Trial(Recipe(exact, outside), 0.0, seconds)]
@@ -100,4 +101,4 @@ def shadow(
         trials.append(tried(Recipe(call, less), data, reference, max_error))
         if trials[-1].error <= max_error:
             break
-    return quickest(trials, max_error, seconds)
+    return quickest(trials, max_error, full)
