@@ -5,6 +5,8 @@
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -241,8 +243,9 @@ plt.show()
 # multiplication and an addition: 9 loads remain 9, and *composed* and *linear* run at one speed
 # to within the machine's noise, since both wait for memory. As a gather, which is how one would
 # port the shader, every read computes four addresses a pixel and takes its time. And 33 taps at
-# once, which move the fewest bytes of all that is separable, lose to four times 9: with more
-# than 15 taps in one loop, XLA's code for a tap is several times slower.
+# once move the fewest bytes of all that is separable, but not four times fewer: of more than 16
+# shifted reads in one sum XLA makes as many copies of the picture, so they are added in groups,
+# each of which writes a picture and has it read again.
 #
 # What did help, each seen in the compiled text before it was believed:
 #
