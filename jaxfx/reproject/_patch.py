@@ -16,14 +16,31 @@ class Patch(NamedTuple):
     columns: Int[Array, "4 ray"]
     shares: Float[Array, "4 ray"]
 
-    def read(self, image: Float[Array, "height width *channel"]) -> Float[Array, "..."]:
+    def read(self, values: Float[Array, "height width"]) -> Float[Array, " ray"]:
         """The mean of the texels that have a share; 0 where none has."""
-        total = jnp.zeros((len(self.rows[0]), *image.shape[2:]), image.dtype)
-        shares = self.shares.astype(image.dtype).reshape(4, -1, *(1 for _ in image.shape[2:]))
-        for row, column, share in zip(self.rows, self.columns, shares, strict=True):
-            texel = image.at[row, column].get(mode="promise_in_bounds")
+        total = jnp.zeros_like(self.shares[0])
+        for row, column, share in zip(self.rows, self.columns, self.shares, strict=True):
+            texel = values.at[row, column].get(mode="promise_in_bounds")
             total = total + share * jnp.where(share > 0, texel, 0)
-        return safe_divide(total, jnp.broadcast_to(jnp.sum(shares, axis=0), total.shape))
+        return safe_divide(total, jnp.sum(self.shares, axis=0))
+
+    def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
+        """The same of every channel, ray channel.
+
+        The loop keeps the patch in memory: fused, each channel would look for the hit anew.
+        """
+
+        def add(total: Array, texel: tuple[Array, Array, Array]) -> tuple[Array, None]:
+            row, column, share = texel
+            color = image.at[row, column].get(mode="promise_in_bounds")
+            share = jnp.broadcast_to(share[:, None], color.shape)
+            return total + share * jnp.where(share > 0, color, 0), None
+
+        shares = self.shares.astype(image.dtype)
+        total = jnp.zeros((shares.shape[1], image.shape[2]), image.dtype)
+        total, _ = jax.lax.scan(add, total, (self.rows, self.columns, shares))
+        whole = jnp.broadcast_to(jnp.sum(shares, axis=0)[:, None], total.shape)
+        return safe_divide(total, whole)
 
 
 def patch(

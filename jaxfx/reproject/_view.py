@@ -17,7 +17,10 @@ from jaxfx.reproject._surface import bilinear_point
 
 
 class View(NamedTuple):
-    """For each of the target's pixels: what it shows of the source, and whether it does."""
+    """For each of the target's pixels: what it shows of the source, and whether it does.
+
+    Where it shows nothing, no texel of the patch has a share.
+    """
 
     pixels: Float[Array, "ray 2"]
     inverse_depth: Float[Array, " ray"]
@@ -54,9 +57,9 @@ def look(
     x, y, z = jnp.moveaxis(point.position, -1, 0)
     anchor = jnp.where(found.mask, jax.lax.stop_gradient(field)[found.y, found.x], 0)
     seen = found.mask & ~unseen
-    return View(
-        jnp.stack([x, y], axis=-1), -z, seen, patch(field, x, y, anchor, hole_threshold)
-    )
+    shown = patch(field, x, y, anchor, hole_threshold)
+    shown = shown._replace(shares=jnp.where(seen[None], shown.shares, 0))
+    return View(jnp.stack([x, y], axis=-1), -z, seen, shown)
 
 
 def _is_unseen(

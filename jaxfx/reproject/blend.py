@@ -85,7 +85,7 @@ def _blended(
 
     def layer(image: Array, depth: Array, source: PinholeCamera) -> tuple[Array, ...]:
         view, along, z = seen(depth, source)
-        return view.patch.read(image).astype(images[0].dtype), view.mask, along, z
+        return view.patch.read_colors(image).astype(images[0].dtype), view.mask, along, z
 
     pictures, masks, along, z = _over_sources(layer, images, depths, sources)
     nearest = jnp.min(jnp.where(masks, z, jnp.inf), axis=0)

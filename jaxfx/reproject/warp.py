@@ -86,8 +86,7 @@ def _drawn(
     pixels = pixel_centers(*shape, dtype).reshape(-1, 2)
     options = {"method": method, "hole_threshold": hole_threshold}
     view = look(depth.astype(dtype), source, target, pixels, **options)
-    drawn = view.patch.read(image)
-    drawn = jnp.where(view.mask[:, None], drawn, 0)
+    drawn = view.patch.read_colors(image)
     return drawn.reshape(*shape, -1), view.mask.astype(image.dtype).reshape(shape)
 
 
