@@ -1,5 +1,6 @@
 """Visible points in a light's space."""
 
+import functools as ft
 import inspect
 
 import jax
@@ -143,6 +144,37 @@ def test_points_beside_and_behind_the_light_have_finite_gradients():
     assert (np.asarray(found.z[:2]) > 0).all()
     for leaf in jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1)))(depth, light)):
         assert np.isfinite(leaf).all()
+
+
+def test_derivatives_reach_depth_and_light_through_the_filters():
+    rng = np.random.default_rng(3)
+    shadow_map = rng.uniform(3, 8, (64, 64))
+    options = {"size": 3, "slope_bias": 0.1}
+
+    quick_jit = ft.partial(
+        jax.jit, compiler_options={"xla_backend_optimization_level": 0}
+    )  # compiling is all of the work
+
+    def total(depth, light, bias, softness):
+        seen = shadow.receivers(depth, eye_camera(), light)
+        soft = options | {"bias": bias, "softness": softness}
+        forms = (
+            shadow.pcf(shadow_map, seen, kernel="gaussian", **soft),
+            shadow.variance(shadow_map, seen, bias=bias, **options),
+        )
+        return sum(weight * jnp.sum(form**2) for weight, form in enumerate(forms, start=1))
+
+    depth = jnp.asarray(rng.uniform(2, 4, (HEIGHT, WIDTH)))
+    at = depth, spot_camera(), jnp.asarray(0.1), jnp.asarray(0.5)
+    loss, slopes = quick_jit(total), quick_jit(jax.grad(total, argnums=(0, 1, 2, 3)))(*at)
+    for index, (value, slope) in enumerate(zip(at, slopes, strict=True)):
+        along = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), value)
+        moved = [jax.tree.map(lambda x, d, s=s: x + s * d, value, along) for s in (1e-6, -1e-6)]
+        ahead, behind = (float(loss(*at[:index], each, *at[index + 1 :])) for each in moved)
+        product = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, slope, along)))
+        expected = (ahead - behind) / 2e-6
+        assert abs(expected) > 1e-3
+        assert float(product) == pytest.approx(expected, rel=1e-4)
 
 
 def test_faults_name_their_argument():
