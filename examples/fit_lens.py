@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from jaxfx import ThinLens, dof, exr, fit, metrics, relight, scene, tradeoff
+from jaxfx import ThinLens, dof, exr, fit, metrics, relight, reproject, scene, tradeoff
 from jaxfx.exr.layers import write_whole
 
 
@@ -34,8 +34,9 @@ import matplotlib.pyplot as plt
 LARGEST_COC = 0.04
 # Passes that antialias the pinhole picture.
 PINHOLE_PASSES = 16
-# Two lines of the chart.
+# The lines of the chart.
 MULTI, WHOLE = "multi-pass", "pinhole passes, then scatter"
+REPROJECTED = "reprojected, passes"
 
 
 def parse() -> argparse.Namespace:
@@ -127,14 +128,18 @@ def near_edges(depth, radius: int):
     return mask if mask.any() else None
 
 
-def contenders(multi_pass, pinhole, scatter, image, samples: int) -> dict:
-    """The methods of the chart: `pinhole` and `multi_pass` take a count of passes."""
+def contenders(multi_pass, pinhole, reprojected, scatter, layered, image, samples: int) -> dict:
+    """The methods of the chart; the first three take a count of passes."""
     # Of a compiled method every call counts the same.
-    jax.block_until_ready(scatter(image))
+    jax.block_until_ready((scatter(image), layered(image), reprojected(1)))
     counts = [*(2**k for k in range(2, math.ceil(math.log2(samples)))), samples]
     # Scatter's picture has its price too, which grows with its antialiasing.
     return (
-        {"scatter of a given picture": lambda: scatter(image)}
+        {
+            "scatter of a given picture": lambda: scatter(image),
+            "layered of a given picture": lambda: layered(image),
+        }
+        | {f"{REPROJECTED} {n}": lambda n=n: reprojected(n) for n in (4, 16, 64)}
         | {f"{WHOLE} {n}": lambda n=n: scatter(pinhole(n)) for n in (1, 4, PINHOLE_PASSES)}
         | {f"{MULTI} {n}": lambda n=n: multi_pass(n) for n in counts}
     )
@@ -142,7 +147,8 @@ def contenders(multi_pass, pinhole, scatter, image, samples: int) -> dict:
 
 def draw_chart(measurements, title: str, path: Path) -> None:
     names = [measurement.name for measurement in measurements]
-    lines = {label: [n for n in names if n.startswith(label)] for label in (MULTI, WHOLE)}
+    labels = MULTI, WHOLE, REPROJECTED
+    lines = {label: [n for n in names if n.startswith(label)] for label in labels}
     figure, ax = plt.subplots(figsize=(8, 5.5), layout="constrained")
     tradeoff.plot(measurements, ax, lines=lines)
     ax.set_title(title)
@@ -252,12 +258,26 @@ def main() -> None:
             image, filled, fitted.lens, gamma=fitted.gamma, epsilon=fitted.epsilon
         )
 
+    # Seen again from all over the lens, by the picture and its depth alone.
+    @jax.jit
+    def seen_again(eye):
+        return jnp.dstack(reproject.warp(image, filled, camera, eye))
+
+    def reprojected(count):
+        options = {"samples": count, "jitter": False, "progress": False}
+        *color, alpha = jnp.moveaxis(
+            dof.accumulate(seen_again, camera, lens, **options).image, -1, 0
+        )
+        return jnp.stack(color, axis=-1) / jnp.maximum(alpha[..., None], 1 / count)
+
     coc = float(jnp.max(fitted.lens.circle_of_confusion(filled)))
     methods = contenders(
         # Of another seed than the reference's, which would count its own passes as its truth.
         lambda count: accumulate(lens.aperture, count, seed + 1).image,
         lambda count: accumulate(0.0, count, seed + 1).image,
+        reprojected,
         scatter,
+        lambda image: dof.layered(image, filled, lens),
         image,
         samples,
     )

@@ -189,6 +189,8 @@ for column, slope in enumerate(SLOPES):
     search = functools.partial(cases.run, fields["posts"], *rays)
     ax.plot(steps, timed(search), "*", color="black", markersize=11)
     ax.set(xlabel="steps", xscale="log", yscale="log")
+    ax.set_xticks([4, 16, 64], [4, 16, 64])
+    ax.minorticks_off()
     ax.set_title("time, posts", fontsize=9)
     ax.grid(alpha=0.3)
 for ax in axes[:3, 0]:

@@ -10,7 +10,11 @@ from jaxfx._numerics import safe_divide
 
 
 class Patch(NamedTuple):
-    """The four texels about a point and their shares, those of others' surfaces 0."""
+    """The four texels about a point and their shares, those of others' surfaces 0.
+
+    A texel whose share is 0 at this very point still has a say in the derivative; it is left
+    out only where it is not finite.
+    """
 
     rows: Int[Array, "4 ray"]
     columns: Int[Array, "4 ray"]
@@ -21,7 +25,7 @@ class Patch(NamedTuple):
         total = jnp.zeros_like(self.shares[0])
         for row, column, share in zip(self.rows, self.columns, self.shares, strict=True):
             texel = values.at[row, column].get(mode="promise_in_bounds")
-            total = total + share * jnp.where(share > 0, texel, 0)
+            total = total + share * _unless_unseen(texel, share)
         return safe_divide(total, jnp.sum(self.shares, axis=0))
 
     def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
@@ -34,13 +38,17 @@ class Patch(NamedTuple):
             row, column, share = texel
             color = image.at[row, column].get(mode="promise_in_bounds")
             share = jnp.broadcast_to(share[:, None], color.shape)
-            return total + share * jnp.where(share > 0, color, 0), None
+            return total + share * _unless_unseen(color, share), None
 
         shares = self.shares.astype(image.dtype)
         total = jnp.zeros((shares.shape[1], image.shape[2]), image.dtype)
         total, _ = jax.lax.scan(add, total, (self.rows, self.columns, shares))
         whole = jnp.broadcast_to(jnp.sum(shares, axis=0)[:, None], total.shape)
         return safe_divide(total, whole)
+
+
+def _unless_unseen(texel: Float[Array, "*shape"], share: Float[Array, "*shape"]) -> Array:
+    return jnp.where((share > 0) | jnp.isfinite(texel), texel, 0)
 
 
 def patch(

@@ -68,6 +68,25 @@ def test_a_plane_moves_by_its_homography(move):
     assert not np.asarray(drawn)[~np.asarray(inside)].any()
 
 
+def test_from_its_own_camera_a_plane_has_the_derivative_of_its_homography():
+    """Every pixel reads the centre of a texel, where the three others have a share of 0."""
+    y, x = np.mgrid[:24, :32] + 0.5
+    image, depth, eye = np.stack([x, y], axis=-1), np.full((24, 32), 2.0), camera()
+
+    def drawn(move):
+        pose = eye.world_from_camera.at[:3, 3].add(move)
+        return warp(image, depth, eye, PinholeCamera(eye.intrinsics, pose))[0]
+
+    jacobian = np.asarray(quick_jit(jax.jacfwd(drawn))(jnp.zeros(3)))
+    focal = float(eye.intrinsics[0, 0])
+    # Pixel u sees f X / Z + c of the source, with X = (u - c) / f * (Z - move[2]) + move[0].
+    forward = -(image - [16, 12]) / 2
+    sideways = np.broadcast_to(np.eye(2) * focal / 2, (24, 32, 2, 2))
+    expected = np.concatenate([sideways, forward[..., None]], axis=-1)
+    inner = np.s_[:-1, :-1]  # the last texel has no neighbour
+    np.testing.assert_allclose(jacobian[inner], expected[inner], atol=1e-9)
+
+
 def test_the_sky_turns_with_the_camera():
     image, depth = picture(), np.full((24, 32), np.inf)
     drawn, alpha = warp(image, depth, camera(), camera(at=(5.0, 1.0, -3.0), turn=0.2))
