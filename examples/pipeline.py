@@ -5,10 +5,10 @@ picture of them: the frame buffer of a new camera (`relight.synthesize`), a key 
 shadow, and depth of field (`dof.scatter`). It is differentiated end to end in the camera (eye
 and turn), the key light (direction and colour) and the lens (aperture and focus distance), and
 Levenberg-Marquardt searches for all of them at once from one picture, which was made from the
-mesh itself, not from the buffers. The search is local: from afar, or too blurred a start, it
-ends with another lens. Writes the stages (`stages.png`), the derivatives
-(`derivatives.png`), the fit (`fit.png`) and the numbers (`report.json`); prints the time of
-every stage.
+mesh itself, not from the buffers. On the still life the search comes near the camera and the
+light, and not to the lens: what the buffers lack is as large as what the lens changes. Writes
+the stages (`stages.png`), the derivatives (`derivatives.png`), the fit (`fit.png`) and the
+numbers (`report.json`); prints the time of every stage.
 """
 
 import argparse
