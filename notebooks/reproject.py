@@ -190,7 +190,7 @@ for column, slope in enumerate(SLOPES):
     ax.plot(steps, timed(search), "*", color="black", markersize=11)
     ax.set(xlabel="steps", xscale="log", yscale="log")
     ax.set_xticks([4, 16, 64], [4, 16, 64])
-    ax.minorticks_off()
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
     ax.set_title("time, posts", fontsize=9)
     ax.grid(alpha=0.3)
 for ax in axes[:3, 0]:
