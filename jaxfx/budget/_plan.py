@@ -125,5 +125,6 @@ def quickest(trials: Sequence[Trial], max_error: float, full_seconds: float) -> 
 def plan(
     call: Any, error: float, seconds: float, full: float, sentences: Sequence[str]
 ) -> Plan:
+    """A plan from plain numbers: the error, its seconds, and those of the full effect."""
     numbers = (jnp.asarray(number, float) for number in (error, seconds, full))
     return Plan(call, *numbers, left_out=tuple(sentences))

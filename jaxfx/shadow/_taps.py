@@ -88,6 +88,7 @@ def without_gradient(kernel: Kernel, data: tuple[Any, ...]) -> Any:
 
 
 def common_dtype(shadow_map: Array, receivers: Receivers) -> jnp.dtype:
+    """What a filter computes in, for a map and receivers of any types."""
     return working_dtype(shadow_map.dtype, *(field.dtype for field in receivers))
 
 
@@ -143,6 +144,7 @@ def lit(
 
 
 def half_width(softness: Float[Array, ""], dtype: Any) -> Float[Array, ""]:
+    """Half of the depths that are neither lit nor shadowed; never 0, so that it may divide."""
     return jnp.maximum(softness.astype(dtype) / 2, jnp.finfo(dtype).tiny * 1e4)
 
 
