@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import OpenEXR
+import OpenImageIO
 import pytest
 
 from jaxfx import GBuffer, OrthographicCamera, PinholeCamera, exr
@@ -87,6 +88,22 @@ def test_the_passes_are_layers(tmp_path):
     assert all(re.fullmatch(r"[a-z]+\.([RGBAXYZ]|V)", name) for name in names)
     # Nuke keeps this name for depth, and Blender takes bare X, Y and Z for a vector.
     assert "depth.Z" in names and not names & set("XYZ")
+
+
+def test_another_reader_finds_the_passes(tmp_path):
+    """OpenImageIO, by which many programs read EXR files."""
+    before = gbuffer()
+    exr.write_gbuffer(tmp_path / "a.exr", before, camera=camera(PinholeCamera, np.float32))
+    file = OpenImageIO.ImageInput.open(str(tmp_path / "a.exr"))
+    names, pixels = file.spec().channelnames, file.read_image("float")
+    for name in PASSES:
+        found = [i for i, channel in enumerate(names) if channel.startswith(f"{name}.")]
+        # Red before green before blue, as X before Y before Z, whatever the order on disk.
+        assert [names[i][-1] for i in found] in (["R", "G", "B"], ["X", "Y", "Z"], ["Z"], ["V"])
+        layer = np.asarray(getattr(before, name)).reshape(5, 7, -1)
+        np.testing.assert_array_equal(pixels[..., found], layer)
+    kept = np.reshape(file.spec().getattribute("jaxfx.world_from_camera"), (4, 4))
+    np.testing.assert_array_equal(kept.astype(np.float32), matrix(1, 4, np.float32))
 
 
 def layers_of(buffer):
