@@ -6,13 +6,13 @@ each of two passes, 50 MB in all; OpenCV keeps some rows in its cache and moves 
 """
 
 import os
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage
+from turns import in_turns
 
 from jaxfx import _sampling, blur
 
@@ -74,27 +74,11 @@ def test_one_pass_of_9_taps(benchmark, peer):
 
 @pytest.mark.parametrize(("peer", "calls"), [("OpenCV", 20), ("SciPy", 1)])
 def test_ratio(benchmark, peer, calls):
-    """Ours and a peer's in turns, so that what else the machine does meets both alike.
-
-    A turn is of several calls: at its start the other's threads may still be spinning. The
-    ratio of the medians of all calls, ours to theirs, is kept as `ratio` with the run.
-    """
+    """Ours and a peer's: the ratio of the medians, ours to theirs, is kept with the run."""
     benchmark.group = f"ours, in turns with {peer}, {calls} calls"
-    theirs, ours = PEERS[peer](), PEERS["discrete"]()
-    times = {theirs: [], ours: []}
-
-    def turn(function):
-        for _ in range(calls):
-            start = time.perf_counter()
-            function()
-            times[function].append(time.perf_counter() - start)
-
-    benchmark.pedantic(
-        turn, args=(ours,), setup=lambda: turn(theirs), rounds=15, warmup_rounds=1
-    )
-    median = {who: 1e3 * np.median(times[who][calls:]) for who in times}
-    benchmark.extra_info["ratio"] = median[ours] / median[theirs]
-    print(f"\n{median[ours]:.2f} ms, {peer} {median[theirs]:.2f} ms")
+    functions = {peer: PEERS[peer](), "ours": PEERS["discrete"]()}
+    median = in_turns(benchmark, functions, calls=calls)
+    benchmark.extra_info["ratio"] = median["ours"] / median[peer]
 
 
 @pytest.mark.parametrize("form", ["one of 33", "four of 9", "four of 9, bilinear reads"])

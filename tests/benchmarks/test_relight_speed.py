@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import relight_scenes as scenes
+from turns import in_turns
 
 from jaxfx import PointLight, Transfer, relight
 
@@ -27,13 +28,17 @@ def run(benchmark, function, rounds=9):
     benchmark.pedantic(waited(function), rounds=rounds, warmup_rounds=1)
 
 
-@pytest.mark.parametrize("count", [1, 10, 100, 1000])
-def test_edit(benchmark, count):
-    benchmark.group = "one edit and its picture, by the number of lights"
+def test_edit(benchmark):
+    """Among 1, 10, 100 and 1000 lights, in turns: all run one program."""
+    benchmark.group = "one edit and its picture, among 1, 10, 100 and 1000 lights"
     gbuffer, camera = scenes.cache(SIZE)
-    state = relight.start(gbuffer, camera, scenes.lights(count))
     other = scenes.lights(1, seed=1)[0]
-    run(benchmark, lambda: state.edit(0, other).image, rounds=15)
+
+    def edit(count):
+        state = relight.start(gbuffer, camera, scenes.lights(count))
+        return waited(lambda: state.edit(0, other).image)
+
+    in_turns(benchmark, {f"{count} lights": edit(count) for count in (1, 10, 100, 1000)})
 
 
 @pytest.mark.parametrize("what", ["diffuse", "roughness of 10 lights"])
