@@ -96,6 +96,15 @@ def _pooled(planes: _Values) -> Float[Array, "rows columns value"]:
 
 def _enlarged(planes: Float[Array, "rows columns value"], shape: tuple[int, ...]) -> _Values:
     """Twice the size, between pixels linearly; cut to `shape`."""
-    rows, columns, count = planes.shape
-    larger = jax.image.resize(planes, (2 * rows, 2 * columns, count), "linear")
-    return larger[: shape[0], : shape[1]]
+    for axis in (0, 1):
+        size = planes.shape[axis]
+        ends = [(1, 1) if axis == each else (0, 0) for each in range(3)]
+        padded = jnp.pad(planes, ends, mode="edge")
+        before, after = (
+            jax.lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, 2)
+        )
+        # A pixel's two halves lie a quarter of its size off its centre.
+        halves = [0.75 * planes + 0.25 * other for other in (before, after)]
+        double = [n * 2 if axis == each else n for each, n in enumerate(planes.shape)]
+        planes = jnp.stack(halves, axis=axis + 1).reshape(double)
+    return planes[: shape[0], : shape[1]]

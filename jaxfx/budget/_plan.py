@@ -1,6 +1,5 @@
 """What a plan is, and how one is chosen: by trying it on the scene that it is for."""
 
-import math
 import statistics
 import time
 from collections.abc import Sequence
@@ -14,8 +13,8 @@ from jaxtyping import Array, Float
 from jaxfx._numerics import is_concrete
 
 
-# Calls after the first of which the median time is taken.
-_CALLS = 3
+# Calls after the first of which the median time is taken, fewer if they take so many seconds.
+_CALLS, _ENOUGH = 3, 0.5
 
 
 @final
@@ -50,19 +49,62 @@ class Plan(eqx.Module):
         return "\n".join([*lines, *(f"- {sentence}" for sentence in self.left_out)])
 
 
-class Recipe(NamedTuple):
-    """A way to make the picture: what is called, and what it leaves out."""
+class Trial(NamedTuple):
+    """A way to make the picture, tried: what it leaves out, its error and its time."""
 
     call: Any
     left_out: str
-
-
-class Trial(NamedTuple):
-    """A recipe, tried: the error that it makes and the time that it takes."""
-
-    recipe: Recipe
     error: float
     seconds: float
+
+
+class Part(NamedTuple):
+    """The data of a part of a scene, and what of its picture is looked at."""
+
+    data: Sequence[Any]
+    core: tuple[slice, ...] = ()
+
+
+class Search:
+    """Ways to make an effect's picture, tried on some parts of a scene or on all of it.
+
+    What the parts say decides which ways are measured on the whole scene, the quickest first.
+    The promise rests on that measurement alone.
+    """
+
+    def __init__(
+        self, effect: Any, data: Sequence[Any], max_error: float, parts: Sequence[Part] = ()
+    ):
+        self.effect, self.max_error = effect, max_error
+        self.whole, self.parts = [Part(data)], parts or [Part(data)]
+        self.references, self.seconds = _drawn(effect, self.parts)
+        self.trials: list[Trial] = []
+        self._in_full = not parts
+
+    def trial(self, call: Any, left_out: str) -> Trial:
+        """A way, tried on the parts."""
+        self.trials.append(_tried(call, left_out, self.parts, self.references))
+        return self.trials[-1]
+
+    def plan(self) -> Plan:
+        """The quickest way that is within the error on the whole scene: or else the effect."""
+        within = [n for n, trial in enumerate(self.trials) if trial.error <= self.max_error]
+        references, full = self.references, self.seconds
+        if within and not self._in_full:
+            references, full = _drawn(self.effect, self.whole)
+        best, chosen = Trial(self.effect, "", 0.0, full), -1
+        for n in sorted(within, key=lambda n: self.trials[n].seconds):
+            if not self._in_full:
+                self.trials[n] = _tried(*self.trials[n][:2], self.whole, references)
+            if self.trials[n].error <= self.max_error and self.trials[n].seconds < full:
+                best, chosen = self.trials[n], n
+                break
+        sentences = [f"{best.left_out}."] if best.left_out else []
+        for trial in (trial for n, trial in enumerate(self.trials) if n != chosen):
+            too_far = trial.error > self.max_error
+            error, time = f"errs by {trial.error:.2g}", f"takes {1e3 * trial.seconds:.3g} ms"
+            sentences.append(f"not taken: {trial.left_out}: {error if too_far else time}.")
+        return plan(best.call, best.error, best.seconds, full, sentences)
 
 
 def check_call(name: str, max_error: Any, data: Any) -> float:
@@ -80,9 +122,9 @@ def check_call(name: str, max_error: Any, data: Any) -> float:
 
 
 def timed(call: Any, data: Sequence[Any]) -> tuple[Any, float]:
-    """What a recipe gives, and the median seconds of a compiled call."""
+    """What a call gives, and the median seconds of a compiled one."""
     result, times = jax.block_until_ready(call(*data)), []
-    for _ in range(_CALLS):
+    while len(times) < _CALLS and sum(times) < _ENOUGH:
         started = time.perf_counter()
         jax.block_until_ready(call(*data))
         times.append(time.perf_counter() - started)
@@ -96,35 +138,26 @@ def root_mean_square(difference: Float[Array, "..."]) -> float:
     return float(jnp.sqrt(jnp.sum(squares) / max(difference.size, 1)))
 
 
-def tried(
-    recipe: Recipe, data: Sequence[Any], reference: Float[Array, "..."], max_error: float
-) -> Trial:
-    """A recipe's error on this scene and, where that will do, its time."""
-    result = recipe.call(*data)
-    error = root_mean_square(result - reference)
-    seconds = timed(recipe.call, data)[1] if error <= max_error else math.inf
-    return Trial(recipe, error, seconds)
-
-
-def quickest(trials: Sequence[Trial], max_error: float, full_seconds: float) -> Plan:
-    """The plan of the quickest trial within the error; one of them must be."""
-    within = [trial for trial in trials if trial.error <= max_error]
-    best = min(within, key=lambda trial: trial.seconds)
-    sentences = [f"{best.recipe.left_out}."] if best.recipe.left_out else []
-    for trial in trials:
-        if trial is not best and trial.recipe.left_out:
-            why = (
-                f"its error would be {trial.error:.2g}"
-                if trial.error > max_error
-                else f"it takes {1e3 * trial.seconds:.3g} ms"
-            )
-            sentences.append(f"not taken: {trial.recipe.left_out}, for {why}.")
-    return plan(best.recipe.call, best.error, best.seconds, full_seconds, sentences)
-
-
 def plan(
     call: Any, error: float, seconds: float, full: float, sentences: Sequence[str]
 ) -> Plan:
     """A plan from plain numbers: the error, its seconds, and those of the full effect."""
     numbers = (jnp.asarray(number, float) for number in (error, seconds, full))
     return Plan(call, *numbers, left_out=tuple(sentences))
+
+
+def _drawn(call: Any, parts: Sequence[Part]) -> tuple[list[Array], float]:
+    """The pictures of all parts, and the seconds that they take together."""
+    results = [timed(call, part.data) for part in parts]
+    # Of a pair it is the picture, and not its coverage.
+    first = lambda result: result[0] if isinstance(result, tuple) else result
+    pairs = zip(results, parts, strict=True)
+    pictures = [first(result)[part.core] for (result, _), part in pairs]
+    return pictures, sum(seconds for _, seconds in results)
+
+
+def _tried(call: Any, text: str, parts: Sequence[Part], references: list[Array]) -> Trial:
+    pictures, seconds = _drawn(call, parts)
+    pairs = zip(pictures, references, strict=True)
+    differences = [(picture - reference).reshape(-1) for picture, reference in pairs]
+    return Trial(call, text, root_mean_square(jnp.concatenate(differences)), seconds)

@@ -1,38 +1,79 @@
 """Reprojection within an error."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx.budget._plan import Plan, Recipe, Trial, check_call, quickest, timed, tried
+from jaxfx._numerics import safe_divide, working_dtype
+from jaxfx._sampling import pixel_centers
+from jaxfx.budget._plan import Plan, Search, check_call
+from jaxfx.budget._tiles import spend, sums, tile_of
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.reproject.blend import blend, choose
+from jaxfx.reproject.blend import _Seen, blend
 
 
-class Blend(eqx.Module):
-    """`reproject.blend` of some of the sources."""
+# The side of a tile, in pixels: a larger one needs more sources, a smaller one more counting.
+_SIDE = 8
+# Rays that are looked for together; fewer would not fill a core.
+_TOGETHER = 4096
+_OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
+# What a pixel that nobody shows any more adds to the squared error: coverage is kept.
+_LOST = 1e30
 
-    chosen: tuple[int, ...] = eqx.field(static=True)
+
+class Part(eqx.Module):
+    """Rays in blocks, each of one source; the sources of a part are alike in shape and type.
+
+    - `members`: static; which sources these are.
+    - `source`: of each block, its place among them.
+    - `pixels`: the target's, row by row; one past the last stands for none.
+    """
+
+    members: tuple[int, ...] = eqx.field(static=True)
+    source: Int[Array, " block"]
+    pixels: Int[Array, "block ray"]
+
+
+class Seen(NamedTuple):
+    """What rays show: for which pixel each is, its colour, whether, how straight, how far."""
+
+    pixel: Int[Array, " ray"]
+    color: Float[Array, "ray channel"]
+    mask: Bool[Array, " ray"]
+    along: Float[Array, " ray"]
+    z: Float[Array, " ray"]
+
+
+class Everything(eqx.Module):
+    """`reproject.blend` of all sources."""
+
     shape: tuple[int, int] | None = eqx.field(static=True)
     title: ClassVar[str] = "reprojection"
 
     def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
         """As the effect."""
-        some = lambda values: [values[index] for index in self.chosen]
-        return blend(some(images), some(depths), some(sources), target, shape=self.shape)
+        return blend(images, depths, sources, target, shape=self.shape)
 
 
-class _Picture(eqx.Module):
-    """The picture of a recipe, without its coverage."""
+class Blend(eqx.Module):
+    """`reproject.blend`, of each source in some tiles only."""
 
-    blend: Blend
+    parts: tuple[Part, ...]
+    shape: tuple[int, int] = eqx.field(static=True)
+    title: ClassVar[str] = "reprojection, tile by tile"
 
-    def __call__(self, *data: Any) -> Any:
+    def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
         """As the effect."""
-        return self.blend(*data)[0]
+        seen = _seen(self.parts, *_as_arrays(images, depths), list(sources), target, self.shape)
+        color, known = _blended(seen, self.shape[0] * self.shape[1])
+        known = known.astype(color.dtype)
+        return color.reshape(*self.shape, -1), known.reshape(self.shape)
 
 
 def reproject(
@@ -44,10 +85,15 @@ def reproject(
     shape: tuple[int, int] | None = None,
     max_error: int | float,
 ) -> Plan:
-    """The fewest sources within an error of `reproject.blend` of all of them, "pyramid".
+    """The fewest rays within an error of `reproject.blend` of all sources, "pyramid".
 
-    Sources are taken in the order of `reproject.choose`, one more at a time, until the picture
-    on this scene is within the error.
+    The effect is drawn once, each source apart. In every tile of 8 x 8 pixels the sources are
+    left out one after another, from the one that has the least share on, for as long as every
+    pixel that was known is known; over the whole picture those first that cost the least error.
+    What is left is drawn and measured against the effect.
+
+    It costs three programs, of which compiling is most: the effect, its sources apart, and the
+    plan; and four renderings of all sources.
 
     **Arguments:**
 
@@ -59,7 +105,7 @@ def reproject(
       nothing is known the picture is 0.
 
     **Returns:** a `Plan`, to be called with `images, depths, sources, target`, as many sources
-    as there are here; it gives image and alpha, as `reproject.blend` does.
+    as there are here, alike in size; it gives image and alpha, as `reproject.blend` does.
 
     **Raises:** `ValueError` as `reproject.blend`, for a negative `max_error` or traced data.
 
@@ -67,17 +113,131 @@ def reproject(
     """
     data = (images, depths, sources, target)
     max_error = check_call("reproject", max_error, data)
-    every = Blend(tuple(range(len(sources))), shape)
-    reference, seconds = timed(_Picture(every), data)
-    trials = [Trial(Recipe(_Picture(every), ""), 0.0, seconds)]
-    count = len(sources)
-    order = choose(depths, sources, target, count=count, shape=shape).chosen.tolist()
-    for few in range(1, count):
-        taken = tuple(sorted(order[:few]))
-        others = ", ".join(str(index) for index in sorted(order[few:]))
-        recipe = Recipe(_Picture(Blend(taken, shape)), f"sources {others}")
-        trials.append(tried(recipe, data, reference, max_error))
-        if trials[-1].error <= max_error:
-            break
-    plan = quickest(trials, max_error, seconds)
-    return eqx.tree_at(lambda plan: plan.recipe, plan, plan.recipe.blend)
+    search = Search(Everything(shape), data, max_error)
+    height, width = search.references[0].shape[:2]
+    size = (height, width)
+    uses = _uses(*_as_arrays(images, depths), sources, target, size, max_error)
+    if not uses.all():
+        idle = ", ".join(str(index) for index in np.flatnonzero(~uses.any(axis=1)))
+        text = f"{1 - uses.mean():.0%} of the rays" + (
+            f", all of sources {idle}" if idle else ""
+        )
+        why = "where others show next to the same"
+        search.trial(Blend(_parts(uses, images, depths, sources), size), f"{text}, {why}")
+    return search.plan()
+
+
+def _as_arrays(images: Any, depths: Any) -> tuple[list[Array], list[Array]]:
+    """Pictures, and depths in types that are computed with."""
+    depths = [jnp.asarray(depth) for depth in depths]
+    return (
+        [jnp.asarray(image) for image in images],
+        [depth.astype(working_dtype(depth.dtype)) for depth in depths],
+    )
+
+
+def _uses(
+    images: list[Array],
+    depths: list[Array],
+    sources: Sequence[PinholeCamera],
+    target: PinholeCamera | OrthographicCamera,
+    size: tuple[int, int],
+    max_error: float,
+) -> Bool[np.ndarray, "source pixel"]:
+    """Which sources to look at for each pixel."""
+    tile, count = tile_of(size, _SIDE), len(sources)
+    everything = np.ones((count, size[0] * size[1]), bool)
+    parts = _parts(everything, images, depths, sources)
+    seen = _seen(parts, images, depths, list(sources), target, size)
+    weights = _weights(seen, everything.shape[1])
+    source = np.concatenate(
+        [np.repeat(np.array(p.members)[np.asarray(p.source)], p.pixels.shape[1]) for p in parts]
+    )
+    shares = np.zeros((count, everything.shape[1] + 1))
+    np.add.at(shares, (source, np.asarray(seen.pixel)), np.asarray(weights, float))
+    # The place of each source in its tile, the one with the largest share first.
+    place = np.argsort(np.argsort(-sums(shares[:, :-1], tile), axis=1), axis=1)
+    own = place[np.append(tile, 0)[np.asarray(seen.pixel)], source]
+    squares = _squares(seen, jnp.asarray(own), jnp.arange(count, -1, -1), size)
+    kept = count - spend(sums(squares, tile), max_error, squares.shape[1] * images[0].shape[2])
+    return (place < kept[:, None])[tile].T
+
+
+def _parts(
+    uses: Bool[np.ndarray, "source pixel"], images: Any, depths: Any, sources: Any
+) -> tuple[Part, ...]:
+    """The rays that are used, in blocks."""
+    kinds: dict[str, list[int]] = {}
+    for index, each in enumerate(zip(images, depths, sources, strict=True)):
+        if uses[index].any():
+            kinds.setdefault(str(jax.tree.map(jnp.shape, each)), []).append(index)
+    parts = []
+    for members in kinds.values():
+        wanted = [np.flatnonzero(uses[index]) for index in members]
+        ray = min(_TOGETHER, uses.shape[1])
+        counts = [-(-len(pixels) // ray) for pixels in wanted]
+        filled = [
+            np.pad(pixels, (0, -len(pixels) % ray), constant_values=uses.shape[1])
+            for pixels in wanted
+        ]
+        blocks = np.concatenate(filled).reshape(-1, ray)
+        source = np.repeat(np.arange(len(members)), counts)
+        arrays = (jnp.asarray(each, jnp.int32) for each in (source, blocks))
+        parts.append(Part(tuple(members), *arrays))
+    return tuple(parts)
+
+
+@eqx.filter_jit
+def _seen(parts: tuple[Part, ...], images, depths, sources, target, size) -> Seen:
+    """What all rays show, block after block."""
+    points = pixel_centers(*size).reshape(-1, 2)
+    found = []
+    for part in parts:
+        members = [(images[i], depths[i], sources[i]) for i in part.members]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
+
+        def block(each, stacked=stacked):
+            source, pixels = each
+            image, depth, camera = jax.tree.map(lambda x: x[source], stacked)
+            rays = _Seen(target, points.at[pixels].get(mode="clip"), _OPTIONS)
+            view, along, z = rays(depth, camera)
+            color = view.patch.read_colors(image).astype(images[0].dtype)
+            return Seen(pixels, color, view.mask, along, z)
+
+        blocks = jax.lax.map(block, (part.source, part.pixels))
+        found.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), blocks))
+    return jax.tree.map(lambda *each: jnp.concatenate(each), *found)
+
+
+@eqx.filter_jit
+def _weights(seen: Seen, count: int) -> Float[Array, " ray"]:
+    """How much each ray counts in its pixel, as in `reproject.blend`."""
+    z = jnp.where(seen.mask, seen.z, jnp.inf)
+    nearest = jnp.full(count, jnp.inf, z.dtype).at[seen.pixel].min(z, mode="drop")
+    nearest = nearest.at[seen.pixel].get(mode="clip")
+    front = seen.mask & (z <= (1 + _OPTIONS["hole_threshold"]) * nearest)
+    return jax.lax.stop_gradient(jnp.where(front, seen.along**8, 0))
+
+
+@eqx.filter_jit
+def _blended(seen: Seen, count: int) -> tuple[Float[Array, "pixel channel"], Array]:
+    """The mean colour of each pixel, and whether it has one."""
+    weight = _weights(seen, count).astype(seen.color.dtype)[:, None]
+    color = jnp.where(weight > 0, seen.color, 0) * weight
+    both = jnp.concatenate([color, weight], axis=-1)
+    both = jnp.zeros((count, both.shape[1]), both.dtype).at[seen.pixel].add(both, mode="drop")
+    weights = jnp.broadcast_to(both[:, -1:], (count, both.shape[1] - 1))
+    return safe_divide(both[:, :-1], weights), weights[:, 0] > 0
+
+
+@eqx.filter_jit
+def _squares(seen: Seen, place: Array, kept: Array, size: tuple[int, int]) -> Array:
+    """For every number of sources that is kept, the squared error that each pixel makes."""
+    count = size[0] * size[1]
+    color, known = _blended(seen, count)
+
+    def square(kept):
+        less, shown = _blended(seen._replace(mask=seen.mask & (place < kept)), count)
+        return jnp.sum((less - color) ** 2, axis=-1) + jnp.where(known & ~shown, _LOST, 0)
+
+    return jax.lax.map(square, kept)

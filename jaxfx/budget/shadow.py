@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfx._numerics import parameter
-from jaxfx.budget._plan import Plan, Recipe, Trial, check_call, plan, quickest, timed, tried
+from jaxfx.budget._plan import Plan, Search, check_call, plan, timed
 from jaxfx.shadow.edge import candidates, edge_pcf
 from jaxfx.shadow.pcf import hard, pcf
 from jaxfx.shadow.receivers import Receivers
@@ -24,6 +24,21 @@ class Hard(eqx.Module):
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
         """As the effect."""
         return hard(shadow_map, receivers, bias=self.bias, slope_bias=self.slope_bias)
+
+
+class Everywhere(eqx.Module):
+    """`shadow.pcf`."""
+
+    bias: Float[Array, ""]
+    slope_bias: Float[Array, ""]
+    size: int = eqx.field(static=True)
+    title: ClassVar[str] = "shadow filtered everywhere"
+
+    def __call__(self, shadow_map: Any, receivers: Any) -> Any:
+        """As the effect."""
+        return pcf(
+            shadow_map, receivers, size=self.size, bias=self.bias, slope_bias=self.slope_bias
+        )
 
 
 class Edge(eqx.Module):
@@ -90,15 +105,12 @@ def shadow(
         why = f"it can't matter in more than {share:.2%} of the pixels."
         seconds = timed(Hard(*biases), data)[1]
         return plan(Hard(*biases), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
-    everywhere = lambda *data: pcf(*data, size=size, bias=biases[0], slope_bias=biases[1])
-    exact, full = Edge(*biases, size), timed(everywhere, data)[1]
-    reference, seconds = timed(exact, data)
+    search = Search(Everywhere(*biases, size), data, max_error)
     outside = f"the filter outside of the {share:.1%} of the pixels where it matters"
-    trials = [Trial(Recipe(exact, outside), 0.0, seconds)]
+    search.trial(Edge(*biases, size), outside)
     for smaller in range(1, size, 2):
         call = Hard(*biases) if smaller == 1 else Edge(*biases, smaller)
         less = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
-        trials.append(tried(Recipe(call, less), data, reference, max_error))
-        if trials[-1].error <= max_error:
+        if search.trial(call, less).error <= max_error:
             break
-    return quickest(trials, max_error, full)
+    return search.plan()
