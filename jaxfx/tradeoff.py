@@ -1,15 +1,18 @@
 """Speed against accuracy, measured in one run and drawn on one chart."""
 
+import functools
 import io
+import itertools
 import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.core
+import jax.stages
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["Measurement", "measure", "pareto", "plot", "save"]
 
 Point = tuple[float, float]
+Cost = Literal["seconds", "memory"]
 
 
 class Measurement(NamedTuple):
@@ -76,7 +80,8 @@ def measure(
     - `max_seconds`: of timed calls for each method; a first call over it is the only one.
     - `memory`: trace each method and compile it once more, to know its memory: that of the
       program that `jax.jit` makes of it, what it closes over counted as arguments. A method
-      that can't be traced has none to know.
+      that can't be traced has none to know. One that is compiled already, a
+      `functools.partial` of what `jax.jit(f).lower(...).compile()` gave, is only asked.
     - `progress`: show a bar on stderr.
 
     **Returns:** a list of `Measurement`, in the order of `methods`.
@@ -116,6 +121,8 @@ def measure(
 
 def _temporary_bytes(method: Callable[[], ArrayLike]) -> float:
     """What one program of all that a method does holds beside its arguments and its picture."""
+    if isinstance(method, functools.partial) and isinstance(method.func, jax.stages.Compiled):
+        return _temporary_bytes_of(method.func)
     try:
         closed = jax.make_jaxpr(method)()
     except Exception:  # It has run before: tracing is what it can't bear.
@@ -126,7 +133,11 @@ def _temporary_bytes(method: Callable[[], ArrayLike]) -> float:
     def program(arrays: list[Array]) -> list[Array]:
         return jax.core.eval_jaxpr(closed.jaxpr, arrays)
 
-    analysis = jax.jit(program).lower(closed.consts).compile().memory_analysis()
+    return _temporary_bytes_of(jax.jit(program).lower(closed.consts).compile())
+
+
+def _temporary_bytes_of(program: jax.stages.Compiled) -> float:
+    analysis = program.memory_analysis()
     return math.nan if analysis is None else float(analysis.temp_size_in_bytes)
 
 
@@ -137,20 +148,40 @@ def _timed(method: Callable[[], ArrayLike]) -> tuple[Array, float]:
     return image, time.perf_counter() - start
 
 
-def pareto(measurements: Sequence[Measurement]) -> list[Measurement]:
-    """Those that no other beats in both time and PSNR, the quickest first.
+def pareto(measurements: Sequence[Measurement], *, cost: Cost = "seconds") -> list[Measurement]:
+    """Those that no other beats in both cost and PSNR, the cheapest first.
 
-    **Arguments:** `measurements`: a sequence of `Measurement`, of any length.
+    **Arguments:**
+
+    - `measurements`: a sequence of `Measurement`, of any length.
+    - `cost`: what is to be small: the time, or the memory, of which those that are not known
+      are left out.
 
     **Returns:** the front, a list of `Measurement`.
 
+    **Raises:** `ValueError` for an unknown `cost`.
+
     **Gradient:** none: it chooses.
     """
+    _check_cost("pareto", cost)
     front = []
-    for one in sorted(measurements, key=lambda m: (m.seconds, -m.psnr)):
+    known = [m for m in measurements if not math.isnan(getattr(m, cost))]
+    for one in sorted(known, key=lambda m: (getattr(m, cost), -m.psnr)):
         if not front or one.psnr > front[-1].psnr:
             front.append(one)
     return front
+
+
+def _check_cost(caller: str, cost: str) -> None:
+    if cost not in get_args(Cost):
+        raise ValueError(f"`{caller}(cost=...)` must be one of {get_args(Cost)}, got {cost!r}.")
+
+
+# How a cost is drawn: its unit's size, and what is written below the axis.
+_AXES = {
+    "seconds": (1e-3, "time of a picture (ms, median)"),
+    "memory": (1e6, "memory beside arguments and picture (MB)"),
+}
 
 
 def plot(
@@ -158,12 +189,14 @@ def plot(
     ax: "Axes",
     *,
     lines: Mapping[str, Sequence[str]] | None = None,
+    cost: Cost = "seconds",
 ) -> None:
-    """The chart: milliseconds, logarithmic, against PSNR, the Pareto front drawn through.
+    """The chart: milliseconds or megabytes against PSNR, the Pareto front drawn through.
 
     Every measurement is a point with its name beside it: filled on the front, hollow where it
     is beaten. Names keep clear of one another and of the points, at the size that the figure
-    has now.
+    has now. The costs are on a logarithmic axis; if any memory is 0, it is linear below the
+    smallest that is not.
 
     **Arguments:**
 
@@ -171,25 +204,34 @@ def plot(
     - `ax`: the matplotlib axes to draw on.
     - `lines`: from a label to the names to join by a line, one method at several settings. A
       point is then named by what its name has after the label.
+    - `cost`: what goes along the axis: the time, or the memory, of which those that are not
+      known are left out.
+
+    **Raises:** `ValueError` for an unknown `cost`.
 
     **Gradient:** none: it draws.
     """
-    by_name = {m.name: m for m in measurements}
-    label_of = {name: label for label, names in (lines or {}).items() for name in names}
-    front = pareto(measurements)
-    milliseconds, decibels = [1e3 * m.seconds for m in front], [m.psnr for m in front]
+    _check_cost("plot", cost)
+    unit, label = _AXES[cost]
+    by_name = {m.name: m for m in measurements if not math.isnan(getattr(m, cost))}
+    place = lambda m: (getattr(m, cost) / unit, m.psnr)
+    front = pareto(measurements, cost=cost)
     style = {"color": "0.85", "linewidth": 6, "solid_capstyle": "round", "zorder": 0}
-    ax.step(milliseconds, decibels, where="post", label="Pareto front", **style)
+    steps = np.reshape([place(m) for m in front], (-1, 2)).T
+    ax.step(*steps, where="post", label="Pareto front", **style)
 
-    colors = {}
-    for label, names in (lines or {}).items():
-        points = [(1e3 * by_name[name].seconds, by_name[name].psnr) for name in names]
-        (line,) = ax.plot(*zip(*points, strict=True), "-", linewidth=1, label=label)
-        colors[label] = line.get_color()
+    label_of, colors, paths = {}, {}, []
+    for line, names in (lines or {}).items():
+        known = [name for name in names if name in by_name]
+        label_of |= dict.fromkeys(known, line)
+        path = np.reshape([place(by_name[name]) for name in known], (-1, 2))
+        (drawn,) = ax.plot(*path.T, "-", linewidth=1, label=line)
+        paths += itertools.pairwise(path)
+        colors[line] = drawn.get_color()
     texts = []
-    for m in measurements:
+    for m in by_name.values():
         color = colors.get(label_of.get(m.name), "0.15")
-        xy, half = (1e3 * m.seconds, m.psnr), 1e3 * m.spread / 2
+        xy, half = place(m), 1e3 * m.spread / 2 if cost == "seconds" else 0.0
         ax.errorbar(
             *xy,
             xerr=half,
@@ -200,13 +242,24 @@ def plot(
         )
         name = m.name.removeprefix(label_of.get(m.name, "")).strip()
         texts.append((name, xy, half, color))
-    ax.set_xscale("log")
-    ax.set_xlabel("time of a picture (ms, median)")
+    _scale(ax, [x for _, (x, _), _, _ in texts])
+    ax.set_xlabel(label)
     ax.set_ylabel("PSNR to the reference (dB)")
     ax.margins(0.12)
     ax.grid(alpha=0.3)
     ax.legend(fontsize="small")
-    _write_names(ax, texts)
+    _write_names(ax, texts, paths)
+
+
+def _scale(ax: "Axes", costs: Sequence[float]) -> None:
+    """Logarithmic, or linear below the smallest if there is a 0."""
+    if 0 not in costs:
+        ax.set_xscale("log")
+    else:
+        least = min((x for x in costs if x > 0), default=1.0)
+        threshold = 10 ** math.floor(math.log10(least))
+        ax.set_xscale("symlog", linthresh=threshold, linscale=0.4)
+    ax.xaxis.set_major_formatter("{x:g}")
 
 
 # The sides of a point that a name may stand on, the better ones first: a direction and how the
@@ -221,27 +274,37 @@ _SIDES = (
     (-0.7, 0.7, "right", "bottom"),
     (-0.7, -0.7, "right", "top"),
 )
+# The part of a name that lies before the place it is aligned to.
+_PART = {"left": 0, "bottom": 0, "center": 0.5, "right": 1, "top": 1}
 # How far from it, in printer's points; from the third on, a hair line leads there.
 _DISTANCES = (6, 11, 18, 28, 40, 54, 70, 90, 115)
 
 
-def _write_names(ax: "Axes", texts: Sequence[tuple[str, Point, float, Any]]) -> None:
+def _write_names(
+    ax: "Axes", texts: Sequence[tuple[str, Point, float, Any]], paths: Sequence[Any]
+) -> None:
     """A name beside each point: the first place where it covers nothing, else the least."""
-    from matplotlib.transforms import Bbox
-
     figure = ax.get_figure(root=True)
     if figure is None:
         return
     figure.draw_without_rendering()  # Until then, nothing has its place.
-    point = figure.dpi / 72
+    point, legend = figure.dpi / 72, ax.get_legend()
+    # Boxes are left, bottom, right and top, in pixels.
+    taken = [legend.get_window_extent().extents] if legend else []
     spots = [ax.transData.transform(xy) for _, xy, _, _ in texts]
-    legend = ax.get_legend()
-    taken = [Bbox([spot - 4 * point, spot + 4 * point]) for spot in spots]
+    taken += [[*(spot - 4 * point), *(spot + 4 * point)] for spot in spots]
     for _, (x, y), half, _ in texts:
         ends = ax.transData.transform([(max(x - half, ax.get_xlim()[0]), y), (x + half, y)])
-        taken.append(Bbox([ends[0] - [0, point], ends[1] + [0, point]]))
-    taken += [legend.get_window_extent()] if legend else []
+        taken.append([*(ends[0] - [0, point]), *(ends[1] + [0, point])])
 
+    for path in paths:
+        begin, end = ax.transData.transform(path)
+        steps = np.linspace(begin, end, 30)
+        taken += [[*(step - point), *(step + point)] for step in steps]
+
+    places = [(distance, side) for distance in _DISTANCES for side in _SIDES]
+    shifts = np.array([distance * point * np.array(side[:2]) for distance, side in places])
+    aligned = np.array([[_PART[word] for word in side[2:]] for _, side in places])
     for (name, xy, _, color), spot in zip(texts, spots, strict=True):
         note = ax.annotate(
             name,
@@ -252,30 +315,24 @@ def _write_names(ax: "Axes", texts: Sequence[tuple[str, Point, float, Any]]) -> 
             color=color,
             arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.4, "shrinkB": 3},
         )
-        size = note.get_window_extent().size
-
-        def box(distance, side, spot=spot, size=size):
-            dx, dy, across, along = side
-            x, y = spot + distance * point * np.array([dx, dy])
-            left = x - size[0] * {"left": 0, "center": 0.5, "right": 1}[across]
-            low = y - size[1] * {"bottom": 0, "center": 0.5, "top": 1}[along]
-            return Bbox.from_bounds(left, low, *size)
-
-        def covered(place):
-            own = box(*place)
-            shared = [Bbox.intersection(own, other) for other in taken]
-            inside = Bbox.intersection(own, ax.bbox)
-            area = sum(b.width * b.height for b in shared if b)
-            return (
-                area + own.width * own.height - (inside.width * inside.height if inside else 0)
-            )
-
-        places = [(distance, side) for distance in _DISTANCES for side in _SIDES]
-        distance, side = min(places, key=lambda place: round(covered(place), 3))
+        size = np.array(note.get_window_extent().size)
+        low = spot + shifts - aligned * size
+        boxes = np.hstack([low, low + size])
+        outside = size.prod() - _shared(boxes, np.array([ax.bbox.extents])).sum(axis=1)
+        covered = _shared(boxes, np.array(taken)).sum(axis=1) + outside
+        best = int(np.argmin(covered.round(3)))
+        distance, side = places[best]
         note.set(position=distance * np.array(side[:2]), ha=side[2], va=side[3])
         if note.arrow_patch is not None:
             note.arrow_patch.set_visible(distance >= _DISTANCES[2])
-        taken.append(box(distance, side))
+        taken.append(boxes[best])
+
+
+def _shared(boxes: Any, others: Any) -> Any:
+    """The areas in which boxes lie over others."""
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    return np.maximum(high - low, 0).prod(axis=-1)
 
 
 def save(figure: "Figure", path: StrPath) -> None:

@@ -1,11 +1,13 @@
 """The chart: what is measured is checked without a clock, the front against brute force."""
 
+import functools
 import inspect
 import math
 import xml.etree.ElementTree
 
 import hypothesis as hyp
 import hypothesis.strategies as st
+import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -94,12 +96,44 @@ def test_faults_are_named():
     call = inspect.unwrap(tradeoff.measure)
     with pytest.raises(ValueError, match=r"`measure\(methods\)` must hold at least one"):
         call({}, REFERENCE)
+    for named in ("pareto", "plot"):
+        with pytest.raises(
+            ValueError, match=rf"`{named}\(cost=\.\.\.\)` must be one of .*'tea'"
+        ):
+            arguments = [Figure().add_subplot()] if named == "plot" else []
+            inspect.unwrap(getattr(tradeoff, named))([], *arguments, cost="tea")
     with pytest.raises(ValueError, match=r"\(16, 20, 3\), got \(16, 19, 3\) from 'wrong'"):
         call({"wrong": lambda: REFERENCE[:, 1:]}, REFERENCE, progress=False)
 
 
 def point(name, seconds, psnr, spread=0.0):
     return tradeoff.Measurement(str(name), seconds, spread, psnr, 0.9, math.nan)
+
+
+def of_memory(name, memory, psnr):
+    return point(name, 1.0, psnr)._replace(memory=memory)
+
+
+def test_the_front_of_memory_leaves_out_what_is_not_known():
+    lean, rich = of_memory("lean", 0.0, 20.0), of_memory("rich", 3e6, 30.0)
+    everything = [rich, of_memory("beaten", 4e6, 30.0), of_memory("?", math.nan, 99.0), lean]
+    assert tradeoff.pareto(everything, cost="memory") == [lean, rich]
+
+
+@pytest.mark.parametrize("least", [0.0, 2e5])
+def test_memory_is_drawn_in_megabytes(least):
+    ax = Figure().add_subplot()
+    everything = [
+        of_memory("a 1", least, 20.0),
+        of_memory("a 2", math.nan, 25.0),
+        of_memory("b", 3e6, 30.0),
+    ]
+    tradeoff.plot(everything, ax, lines={"a": ["a 1", "a 2"]}, cost="memory")
+    assert ax.get_xlabel() == "memory beside arguments and picture (MB)"
+    assert ax.get_xscale() == ("symlog" if least == 0 else "log")
+    assert [text.get_text() for text in ax.texts] == ["1", "b"]
+    drawn = {tuple(xy) for line in ax.lines for xy in line.get_xydata()}
+    assert drawn == {(least / 1e6, 20.0), (3.0, 30.0)}
 
 
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(1, 6)), max_size=12)
@@ -208,6 +242,18 @@ def test_saving_leaves_the_settings_alone_and_says_what_it_can_not(ax, tmp_path)
     tradeoff.save(ax.figure, tmp_path / "chart.pdf")
     assert dict(matplotlib.rcParams) == before
     assert [path.name for path in tmp_path.iterdir()] == ["chart.pdf"]
+
+
+def test_a_compiled_method_is_asked_and_not_compiled_again(monkeypatch):
+    image = jnp.asarray(REFERENCE)
+    program = (
+        jax.jit(lambda x: jnp.sort(jnp.sort(x.ravel())[::-1] ** 2).reshape(x.shape))
+        .lower(image)
+        .compile()
+    )
+    monkeypatch.setattr(jax, "make_jaxpr", None)
+    (found,) = measure({"a": functools.partial(program, image)}, repeats=1, memory=True)
+    assert found.memory == program.memory_analysis().temp_size_in_bytes > 0
 
 
 def test_memory_is_that_of_one_program():

@@ -1,0 +1,420 @@
+"""What the atlas measures: every method of every effect at several settings, on two scenes."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+
+from jaxfx import (
+    PinholeCamera,
+    PointLight,
+    SpotLight,
+    ThinLens,
+    blur,
+    budget,
+    dof,
+    relight,
+    reproject,
+    scene,
+    shadow,
+)
+from jaxfx._sampling import pixel_centers
+
+
+STILL, FENCE, SPIKES, HILLS, POSTS = "still life", "fence", "spikes", "hills", "posts"
+MAP_SIZE = 512
+# Where the lamp of the shadows is, what it shines at, and its side, in each scene.
+LAMPS = {
+    STILL: ((-1.2, 2.6, -1.6), (0.0, 0.4, -3.8), 0.3),
+    FENCE: ((-1.4, 2.6, 3.0), (0.0, 0.6, -1.0), 0.3),
+}
+
+
+class Point(NamedTuple):
+    """Where methods are measured: a scene, the picture's side and the effect's own size."""
+
+    scene: str
+    side: int
+    own: int
+    passes: int = 128
+
+
+class Case(NamedTuple):
+    """What the methods are given there, what they should give, and the pixels that count.
+
+    `methods` holds functions of `data` by method and setting, the usual setting first. They
+    hold nothing of the scene, so that one program serves both.
+    """
+
+    data: tuple
+    truth: Any
+    methods: dict[str, dict[str, Any]]
+    counted: Any = None
+
+
+class OnHost(NamedTuple):
+    """A method that is no single program: its memory is not known."""
+
+    call: Callable[..., Any]
+
+
+class Planned(NamedTuple):
+    """A method that is chosen by looking at the data; from an error to a plan."""
+
+    plan: Callable[..., Any]
+
+
+# --- The scenes
+
+
+def fence():
+    """Bars a few pixels wide before a card and a wall of tiles: thin things, hidden ones."""
+    import trimesh
+    from trimesh.visual import ColorVisuals
+
+    rng, boxes = np.random.default_rng(0), []
+
+    def box(low, high, color):
+        one = trimesh.creation.box(bounds=[low, high])
+        one.visual = ColorVisuals(one, face_colors=[*color, 1.0])
+        boxes.append(one)
+
+    box((-4, -0.2, -3), (4, 0, 3), (0.6, 0.6, 0.55))
+    tile = np.array([0.48, 0.48, 0.1])
+    for x, y in np.ndindex(16, 8):
+        corner = np.array([-4 + x / 2, y / 2, -2.2])
+        box(corner, corner + tile, rng.uniform(0.2, 1.0, 3))
+    box((-0.5, 0.3, -1.0), (0.5, 1.3, -0.95), (0.9, 0.35, 0.2))
+    for x in np.arange(-1.2, 1.25, 0.3):
+        box((x, 0, 0.5), (x + 0.04, 1.6, 0.54), (0.15, 0.2, 0.3))
+    found = scene.from_trimesh(trimesh.util.concatenate(boxes))
+    return dataclasses.replace(
+        found, viewpoint=scene.Viewpoint((0.5, 1.1, 3.4), (0.0, 0.8, -0.5), 0.7)
+    )
+
+
+mesh_of = functools.cache(lambda name: fence() if name == FENCE else scene.still_life())
+
+
+@functools.cache
+def view(name: str, side: int):
+    """The mesh, its camera and the deep frame buffer, and what shades any other one."""
+    mesh = mesh_of(name)
+    camera = scene.default_camera(mesh, height=side, width=side)
+    lights, shade = scene.default_lights(camera), jax.jit(relight.render)
+
+    def render(eye, layer=0):
+        gbuffer = scene.gbuffer(mesh, eye, height=side, width=side, layer=layer)
+        return shade(gbuffer, eye, lights), gbuffer
+
+    return camera, *render(camera), render
+
+
+def orbit(camera: PinholeCamera, degrees: float, distance: float) -> PinholeCamera:
+    """The camera turned about a point on its axis."""
+    pose, angle = np.asarray(camera.world_from_camera, np.float64), np.deg2rad(degrees)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    turn, pivot = np.eye(4), pose[:3, 3] + distance * pose[:3, 2]
+    turn[:3, :3] = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    return PinholeCamera(camera.intrinsics, jnp.asarray(turn @ pose, jnp.float32))
+
+
+# --- The effects
+
+
+def depth_of_field(at: Point) -> Case:
+    camera, _, gbuffer, render = view(at.scene, at.side)
+    farthest = jnp.max(jnp.where(jnp.isfinite(gbuffer.depth), gbuffer.depth, 0))
+    near_first = jnp.minimum(gbuffer.depth, farthest)  # An empty background would leak.
+    focus = jnp.quantile(near_first, 0.75 if at.scene == FENCE else 1 / 3)
+    unit = ThinLens.from_camera(camera, aperture=1.0, focus_distance=focus)
+    aperture = at.own / jnp.max(unit.circle_of_confusion(near_first))
+    lens = ThinLens(aperture, focus, unit.focal_pixels)
+
+    def passes(count, aperture, seed, eye=lens):
+        eye = ThinLens(aperture, eye.focus_distance, eye.focal_pixels)
+        options = {"samples": count, "seed": seed, "progress": False}
+        return dof.accumulate(lambda eye: render(eye)[0], camera, eye, **options).image
+
+    image = passes(16, 0.0, 1)  # As antialiased as the reference.
+    second, hidden = render(camera, layer=1)
+    behind = second, jnp.minimum(hidden.depth, farthest)
+    coc = 1.001 * at.own
+    of = lambda method, **how: (
+        lambda image, depth, lens, _: method(image, depth, lens, max_coc=coc, **how)
+    )
+    taps = at.side**2 * (at.own + 1) ** 2
+    kernels = ("shift", "tiles", "spans", *(["segment_sum"] if taps < 2**24 else []))
+    methods = {
+        "scatter": {"auto": of(dof.scatter), "gamma 1": of(dof.scatter, gamma=1.0)},
+        **{f"scatter, {name}": {"": of(dof.scatter, kernel=name)} for name in kernels},
+        "layered": {
+            "1 layer": of(dof.layered),
+            "2 layers": lambda image, depth, lens, behind: dof.layered(
+                image, depth, lens, max_coc=coc, behind=behind
+            ),
+        },
+        "gather": {f"{n} taps": of(dof.gather, taps=n) for n in (32, 8, 128)},
+        "depth sorted": {f"{n}": of(dof.depth_sorted, slices=n) for n in (8, 4, 16)},
+        "blend": {"": of(dof.blend)},
+        "separable": {"": of(dof.separable)},
+        "anisotropic diffusion": {"": of(dof.anisotropic_diffusion)},
+        "implicit diffusion": {"": of(dof.implicit_diffusion)},
+        "multi-pass": {
+            f"{n}": OnHost(lambda *_, n=n: passes(n, aperture, 1)) for n in (8, 4, 16, 32)
+        },
+        "plan": plans(budget.dof, lambda *data: data[:3]),
+    }
+    truth = passes(at.passes, aperture, 0)
+    return Case((image, near_first, lens, behind), truth, methods)
+
+
+def plans(
+    plan: Callable[..., Any],
+    given: Callable[..., Any],
+    picture: Callable[[Any], Any] = lambda result: result,
+) -> dict[str, Planned]:
+    """A plan for each of two errors, made for and called with what it is given of the data."""
+
+    def make(error, *data):
+        found = plan(*given(*data), max_error=error)
+        return lambda *data: picture(found(*given(*data)))
+
+    return {f"{error:g}": Planned(functools.partial(make, error)) for error in (0.01, 0.03)}
+
+
+def blurred(at: Point) -> Case:
+    if at.scene == STILL:
+        image = view(STILL, at.side)[1]
+    else:  # Highlights over a step, and at the border.
+        rng = np.random.default_rng(0)
+        image = (rng.random((at.side, at.side, 3)) > 0.998) * np.float32(50)
+        image[:, at.side // 2 :] += 1
+    weights = np.asarray(blur.binomial_weights(9, row=12), np.float64)
+    sigma = math.sqrt(at.own * weights @ (np.arange(9) - 4.0) ** 2)
+    odd = lambda reach: 2 * max(1, math.ceil(reach)) + 1
+    row = 2 * round(2 * sigma**2)
+
+    def at_half(image, taps):
+        half = blur.downsample(image, taps=taps)
+        # What the halving and the way back blur already.
+        rest = math.sqrt(max(sigma**2 - (1.25 if taps == 4 else 0.75), 0)) / 2
+        half = blur.gaussian(half, sigma=rest, taps=odd(3 * rest))
+        return jax.image.resize(half, image.shape, "linear")
+
+    methods = {
+        "one kernel": {
+            f"{reach} sigma": lambda image, reach=reach: blur.gaussian(
+                image, sigma=sigma, taps=odd(reach * sigma)
+            )
+            for reach in (3, 2, 4)
+        },
+        "Pascal's row": {
+            f"{reach} sigma": lambda image, reach=reach: blur.gaussian(
+                image, row=row, taps=min(odd(reach * sigma), row + 1)
+            )
+            for reach in (3, 2)
+        },
+        "9 taps composed": {"": lambda image: blur.gaussian(image, passes=at.own)},
+        "9 taps composed, linear": {
+            "": lambda image: blur.gaussian(image, passes=at.own, sampling="linear")
+        },
+        "at half size": {
+            f"{taps} taps": functools.partial(at_half, taps=taps) for taps in (2, 4)
+        },
+    }
+    truth = np.asarray(image, np.float64)
+    for axis in (0, 1):
+        how = {"axis": axis, "mode": "nearest", "truncate": 8.0}
+        truth = scipy.ndimage.gaussian_filter1d(truth, sigma, **how)
+    return Case((jnp.asarray(image),), truth.astype(np.float32), methods)
+
+
+def warped(at: Point) -> Case:
+    camera, _, gbuffer, render = view(at.scene, at.side)
+    distance = float(jnp.median(gbuffer.depth))
+    cameras = [orbit(camera, degrees, distance) for degrees in (0, 12, -8, 24)]
+    images, buffers = zip(*map(render, cameras), strict=True)
+    target = orbit(camera, at.own, distance)
+    of = lambda method: (
+        lambda images, depths, cameras, target: reproject.warp(
+            images[0], depths[0], cameras[0], target, method=method
+        )
+    )
+    few = lambda count: (
+        lambda images, depths, cameras, target: reproject.blend(
+            images[:count], depths[:count], cameras[:count], target
+        )
+    )
+    picture = lambda call: lambda *data: call(*data)[0]
+    methods = {f"warp, {name}": {"": picture(of(name))} for name in SEARCHES} | {
+        "blend": {f"{count} sources": picture(few(count)) for count in (2, 4)},
+        "plan": plans(budget.reproject, lambda *data: data, lambda result: result[0]),
+    }
+    data = (list(images), [buffer.depth for buffer in buffers], cameras, target)
+    truth, there = render(target)
+    return Case(data, truth, methods, seen(there.depth, target, gbuffer.depth, camera))
+
+
+def seen(depth, camera, other_depth, other) -> np.ndarray:
+    """The pixels whose points another camera sees too, by both cameras' depth."""
+    known = jnp.isfinite(depth)
+    height, width = depth.shape
+    pixels = pixel_centers(height, width, depth.dtype)
+    spots, z = other.project(camera.unproject(pixels, jnp.where(known, depth, 1)))
+    column, row = np.moveaxis(np.asarray(spots), -1, 0).astype(int)
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    nearest = np.asarray(other_depth)[row * inside, column * inside]
+    return inside & np.asarray(known) & (np.abs(np.asarray(z) / nearest - 1) < 0.03)
+
+
+SEARCHES = ("pyramid", "descent", "linear", "relief")
+
+
+def searched(at: Point) -> Case:
+    """Slanting rays over a depth map, one for each texel; the picture is the depths hit."""
+    y, x = np.mgrid[: at.side, : at.side] / at.side
+    depth = 0.6 + 0.15 * np.sin(9 * x + 3 * y) * np.cos(7 * y - x)
+    if at.scene == POSTS:  # One texel wide, as its gaps are.
+        depth[4::9, 4::9] = 0.3
+        depth[:, at.side // 2 :] = 0.35
+        depth[4::9, at.side // 2 + 4 :: 9] = 0.7
+    way = at.side * np.array([0.25, 0.08])
+    origin = np.dstack([at.side * np.dstack([x, y]) + 0.5 - way / 2, 0 * x])
+    direction = np.broadcast_to([*way, 1.0], origin.shape)
+
+    def of(method, steps):
+        def call(depth, origin, direction):
+            how = {"method": method, "max_steps": steps}
+            hit = reproject.intersect(depth, origin, direction, **how)
+            return jnp.where(hit.mask, hit.position[..., 2], 1.0)[..., None]
+
+        return call
+
+    every = {"descent": (at.own, 4, 6)}  # Its steps are levels.
+    methods = {
+        name: {f"{n}": of(name, n) for n in every.get(name, (at.own, 8, 16, 128))}
+        for name in SEARCHES
+    }
+    data = tuple(jnp.asarray(array, jnp.float32) for array in (depth, origin, direction))
+    return Case(data, of("pyramid", None)(*data), methods)
+
+
+def shadowed(at: Point) -> Case:
+    camera, _, gbuffer, _ = view(at.scene, at.side)
+    mesh, (position, target, lamp) = mesh_of(at.scene), LAMPS[at.scene]
+    light = SpotLight(position, np.subtract(target, position), [1.0, 1.0, 1.0], 0.7, 0.9)
+    (eye,) = shadow.light_cameras(light, map_size=MAP_SIZE)
+    shadow_map = scene.depth(mesh, eye, height=MAP_SIZE, width=MAP_SIZE)
+    known = jnp.isfinite(gbuffer.depth)
+    depth = jnp.where(known, gbuffer.depth, 1)
+    receivers = shadow.receivers(depth, camera, eye, normal=gbuffer.normal)
+    points = np.asarray(camera.unproject(pixel_centers(at.side, at.side, jnp.float32), depth))
+    points = points + 2e-3 * np.asarray(gbuffer.normal)
+    right, down = lamp * np.asarray(eye.world_from_camera)[:3, :2].T
+    steps = (np.arange(6) + 0.5) / 6 - 0.5
+    ends = [np.array(position) + a * right + b * down for a in steps for b in steps]
+    lit = np.stack([scene.visible(mesh, points, end) for end in ends])
+    facing = np.sum((np.array(position) - points) * np.asarray(gbuffer.normal), -1) > 0.1
+    inside = np.abs(np.stack(receivers[:2]) - MAP_SIZE / 2).max(axis=0) < 0.47 * MAP_SIZE
+
+    def of(method, slope, **how):
+        def call(shadow_map, receivers, eye):
+            data = (shadow_map, receivers, *([eye] if method is shadow.pcss else []))
+            return method(*data, bias=0.01, slope_bias=slope / 2, **how)[..., None]
+
+        return call
+
+    sizes = tuple(dict.fromkeys((at.own, 3, 7, 15)))
+    several = lambda method, **how: {f"{n}": of(method, n, size=n, **how) for n in sizes}
+    one = lambda method, **how: {"": of(method, at.own, size=at.own, **how)}
+    reach = lambda n: {"size": n, "mask": "screen", "dilation": n // 2 + 2}
+    plan = functools.partial(budget.shadow, size=at.own, bias=0.01, slope_bias=at.own / 2)
+    methods = {
+        "hard": {"": of(shadow.hard, 1)},
+        "pcf": several(shadow.pcf),
+        "pcf, tent": one(shadow.pcf, kernel="tent"),
+        "pcf, Gaussian": one(shadow.pcf, kernel="gaussian"),
+        "edges by depth": several(shadow.edge_pcf, mask="depth"),
+        "edges by screen": {f"{n}": of(shadow.edge_pcf, n, **reach(n)) for n in sizes},
+        "prefiltered": several(shadow.prefiltered),
+        "variance": several(shadow.variance),
+        "pcss": several(shadow.pcss, light_size=lamp),
+        "plan": plans(plan, lambda *data: data[:2], lambda result: result[..., None]),
+    }
+    data, counted = (shadow_map, receivers, eye), np.asarray(known) & inside & facing
+    return Case(data, lit.mean(axis=0, dtype=np.float32)[..., None], methods, counted)
+
+
+def relit(at: Point) -> Case:
+    camera, _, gbuffer, render = view(at.scene, at.side)
+    rng = np.random.default_rng(0)
+    low, high = mesh_of(at.scene).bounds
+    places = low + (high - low) * rng.uniform([0.2, 0.7, 0.5], [0.8, 1.2, 1.3], (at.own + 1, 3))
+    power = 0.8 ** np.arange(at.own + 1)  # Some matter more than others.
+    power = power / np.sum(power[:-1]) * 0.15 * np.sum((high - low) ** 2)
+    *lights, other = (
+        PointLight(place.astype(np.float32), np.full(3, p, np.float32))
+        for place, p in zip(places, power, strict=True)
+    )
+    # The cache with what the pixel in the middle is made of painted black, and dull.
+    middle = gbuffer.depth.shape[0] // 2
+    same = lambda values: (values == values[middle, middle]).reshape(*gbuffer.depth.shape, -1)
+    mask = same(gbuffer.diffuse).all(-1) & same(gbuffer.roughness).all(-1)
+    without = jnp.where(mask[..., None], 0, gbuffer.diffuse)
+    black = eqx.tree_at(lambda g: g.diffuse, gbuffer, without)
+    duller = jnp.where(mask, 1, gbuffer.roughness)
+    dull = eqx.tree_at(lambda g: g.roughness, gbuffer, duller)
+    start = lambda gbuffer, lights: relight.start(gbuffer, camera, lights)
+    distance = float(jnp.median(gbuffer.depth))
+    cameras = [orbit(camera, degrees, distance) for degrees in (-8, 8, 16, -16)]
+    data = {
+        "of": (gbuffer, camera, lights),
+        "new": (lights[0], lights[-1]),
+        "edit": start(gbuffer, [other, *lights[1:]]),
+        "add": start(gbuffer, lights[:-1]),
+        "remove": start(gbuffer, [*lights, other]),
+        "paint": (mask, gbuffer.diffuse[middle, middle], gbuffer.roughness[middle, middle]),
+        "black": start(black, lights),
+        "dull": start(dull, lights),
+        "caches": ([render(eye)[1] for eye in cameras], cameras),
+    }
+
+    def new_view(count, **how):
+        def call(data):
+            caches, eyes = (each[:count] for each in data["caches"])
+            gbuffer, camera, lights = data["of"]
+            found, coverage = relight.synthesize(
+                caches, eyes, camera, depth=gbuffer.depth, **how
+            )
+            return relight.render(relight.fill_holes(found, coverage)[0], camera, lights)
+
+        return call
+
+    methods = {
+        "render": {"": lambda data: relight.render(*data["of"])},
+        "start": {"": lambda data: relight.start(*data["of"]).image},
+        "edit": {"": lambda data: data["edit"].edit(0, data["new"][0]).image},
+        "add": {"": lambda data: data["add"].add(data["new"][1]).image},
+        "remove": {"": lambda data: data["remove"].remove(len(data["of"][2])).image},
+        "paint": {
+            "diffuse": lambda data: (
+                data["black"].paint(data["paint"][0], diffuse=data["paint"][1]).image
+            ),
+            "roughness": lambda data: (
+                data["dull"].paint(data["paint"][0], roughness=data["paint"][2]).image
+            ),
+        },
+        "new view": {f"{n} caches": new_view(n) for n in (4, 1, 2)}
+        | {"4, by detail": new_view(4, weights="detail")},
+        "plan": plans(budget.relight, lambda data: data["of"]),
+    }
+    return Case((data,), relight.render(*data["of"]), methods)
