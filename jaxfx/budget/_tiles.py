@@ -1,17 +1,64 @@
-"""An error that is spent tile by tile, where it saves most."""
+"""An error that is spent tile by tile, where it saves most, and what is left to do then.
 
+What makes a picture (the lights, the sources) is left out tile by tile. The pixels that each is
+still for go in blocks of one size: a program for them has one shape, however they are spread.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 
+# The side of a tile, in pixels: a larger one needs more, a smaller one takes more counting.
+_SIDE = 8
+# Pixels of a block; fewer would not fill a core.
+_BLOCK = 4096
 # A plan's own picture may round a little otherwise than what it was chosen by.
 _SPENT = 0.999
 
 
-def tile_of(shape: tuple[int, int], side: int) -> Int[np.ndarray, " pixel"]:
-    """For every pixel, row by row, the number of its tile of `side` x `side` pixels."""
-    rows, columns = (np.arange(size) // side for size in shape)
+class Blocks(eqx.Module):
+    """Pixels in blocks, each for one of some items that are alike in shape and type.
+
+    - `members`: static; which items these are.
+    - `item`: of each block, its place among them.
+    - `pixels`: row by row; one past the picture's last stands for none.
+    """
+
+    members: tuple[int, ...] = eqx.field(static=True)
+    item: Int[Array, " block"]
+    pixels: Int[Array, "block pixel"]
+
+
+def blocks(uses: Bool[np.ndarray, "item pixel"], items: Sequence[Any]) -> tuple[Blocks, ...]:
+    """The pixels that each item is used for."""
+    kinds: dict[str, list[int]] = {}
+    for index in np.flatnonzero(uses.any(axis=1)).tolist():
+        kinds.setdefault(str(jax.tree.map(jax.typeof, items[index])), []).append(index)
+    size, found = min(_BLOCK, uses.shape[1]), []
+    for members in kinds.values():
+        wanted = [np.flatnonzero(uses[index]) for index in members]
+        filled = [
+            np.pad(pixels, (0, -len(pixels) % size), constant_values=uses.shape[1])
+            for pixels in wanted
+        ]
+        item = np.repeat(np.arange(len(members)), [len(pixels) // size for pixels in filled])
+        arrays = item, np.concatenate(filled).reshape(-1, size)
+        found.append(
+            Blocks(tuple(members), *(jnp.asarray(array, jnp.int32) for array in arrays))
+        )
+    return tuple(found)
+
+
+def tile_of(shape: tuple[int, int]) -> Int[np.ndarray, " pixel"]:
+    """For every pixel, row by row, the number of its tile of 8 x 8 pixels."""
+    rows, columns = (np.arange(size) // _SIDE for size in shape)
     return (rows[:, None] * (columns[-1] + 1) + columns[None]).reshape(-1)
 
 

@@ -190,4 +190,4 @@ def _gathered(search: Search, largest: float) -> None:
     variance = (few.error**2 - more.error**2) / (1 / _FEW - 1 / _MORE)
     room = search.max_error**2 - (more.error**2 - variance / _MORE)
     if room > 0 and _MORE < variance / room <= _MOST:
-        errs(math.ceil(variance / room))
+        errs(2 ** math.ceil(math.log2(variance / room)))

@@ -13,31 +13,14 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
-from jaxfx.budget._tiles import spend, sums, tile_of
+from jaxfx.budget._tiles import Blocks, blocks, spend, sums, tile_of
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.reproject.blend import _Seen, blend
 
 
-# The side of a tile, in pixels: a larger one needs more sources, a smaller one more counting.
-_SIDE = 8
-# Rays that are looked for together; fewer would not fill a core.
-_TOGETHER = 4096
 _OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
 # What a pixel that nobody shows any more adds to the squared error: coverage is kept.
 _LOST = 1e30
-
-
-class Part(eqx.Module):
-    """Rays in blocks, each of one source; the sources of a part are alike in shape and type.
-
-    - `members`: static; which sources these are.
-    - `source`: of each block, its place among them.
-    - `pixels`: the target's, row by row; one past the last stands for none.
-    """
-
-    members: tuple[int, ...] = eqx.field(static=True)
-    source: Int[Array, " block"]
-    pixels: Int[Array, "block ray"]
 
 
 class Seen(NamedTuple):
@@ -64,13 +47,13 @@ class Everything(eqx.Module):
 class Blend(eqx.Module):
     """`reproject.blend`, of each source in some tiles only."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[Blocks, ...]
     shape: tuple[int, int] = eqx.field(static=True)
     title: ClassVar[str] = "reprojection, tile by tile"
 
     def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
         """As the effect."""
-        seen = _seen(self.parts, *_as_arrays(images, depths), list(sources), target, self.shape)
+        seen = _seen(_chosen(self.parts, images, depths, sources), target, self.shape)
         color, known = _blended(seen, self.shape[0] * self.shape[1])
         known = known.astype(color.dtype)
         return color.reshape(*self.shape, -1), known.reshape(self.shape)
@@ -116,42 +99,40 @@ def reproject(
     search = Search(Everything(shape), data, max_error)
     height, width = search.references[0].shape[:2]
     size = (height, width)
-    uses = _uses(*_as_arrays(images, depths), sources, target, size, max_error)
+    uses = _uses(*data, size, max_error)
     if not uses.all():
         idle = ", ".join(str(index) for index in np.flatnonzero(~uses.any(axis=1)))
-        text = f"{1 - uses.mean():.0%} of the rays" + (
-            f", all of sources {idle}" if idle else ""
-        )
-        why = "where others show next to the same"
-        search.trial(Blend(_parts(uses, images, depths, sources), size), f"{text}, {why}")
+        text = f"{1 - uses.mean():.0%} of the rays{', all of sources ' if idle else ''}{idle}"
+        parts = blocks(uses, list(zip(images, depths, sources, strict=True)))
+        search.trial(Blend(parts, size), f"{text}, where others show next to the same")
     return search.plan()
 
 
-def _as_arrays(images: Any, depths: Any) -> tuple[list[Array], list[Array]]:
-    """Pictures, and depths in types that are computed with."""
-    depths = [jnp.asarray(depth) for depth in depths]
-    return (
-        [jnp.asarray(image) for image in images],
-        [depth.astype(working_dtype(depth.dtype)) for depth in depths],
-    )
+def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> list[Any]:
+    """The sources of all parts, with their blocks. A program does not know which they are."""
+
+    def source(index: int) -> tuple[Array, Array, PinholeCamera]:
+        depth = jnp.asarray(depths[index])
+        return (
+            jnp.asarray(images[index]),
+            depth.astype(working_dtype(depth.dtype)),
+            sources[index],
+        )
+
+    return [([source(n) for n in part.members], part.item, part.pixels) for part in parts]
 
 
 def _uses(
-    images: list[Array],
-    depths: list[Array],
-    sources: Sequence[PinholeCamera],
-    target: PinholeCamera | OrthographicCamera,
-    size: tuple[int, int],
-    max_error: float,
+    images: Any, depths: Any, sources: Any, target: Any, size: tuple[int, int], max_error: float
 ) -> Bool[np.ndarray, "source pixel"]:
     """Which sources to look at for each pixel."""
-    tile, count = tile_of(size, _SIDE), len(sources)
+    tile, count = tile_of(size), len(sources)
     everything = np.ones((count, size[0] * size[1]), bool)
-    parts = _parts(everything, images, depths, sources)
-    seen = _seen(parts, images, depths, list(sources), target, size)
+    parts = blocks(everything, list(zip(images, depths, sources, strict=True)))
+    seen = _seen(_chosen(parts, images, depths, sources), target, size)
     weights = _weights(seen, everything.shape[1])
     source = np.concatenate(
-        [np.repeat(np.array(p.members)[np.asarray(p.source)], p.pixels.shape[1]) for p in parts]
+        [np.repeat(np.array(p.members)[np.asarray(p.item)], p.pixels.shape[1]) for p in parts]
     )
     shares = np.zeros((count, everything.shape[1] + 1))
     np.add.at(shares, (source, np.asarray(seen.pixel)), np.asarray(weights, float))
@@ -163,37 +144,11 @@ def _uses(
     return (place < kept[:, None])[tile].T
 
 
-def _parts(
-    uses: Bool[np.ndarray, "source pixel"], images: Any, depths: Any, sources: Any
-) -> tuple[Part, ...]:
-    """The rays that are used, in blocks."""
-    kinds: dict[str, list[int]] = {}
-    for index, each in enumerate(zip(images, depths, sources, strict=True)):
-        if uses[index].any():
-            kinds.setdefault(str(jax.tree.map(jnp.shape, each)), []).append(index)
-    parts = []
-    for members in kinds.values():
-        wanted = [np.flatnonzero(uses[index]) for index in members]
-        ray = min(_TOGETHER, uses.shape[1])
-        counts = [-(-len(pixels) // ray) for pixels in wanted]
-        filled = [
-            np.pad(pixels, (0, -len(pixels) % ray), constant_values=uses.shape[1])
-            for pixels in wanted
-        ]
-        blocks = np.concatenate(filled).reshape(-1, ray)
-        source = np.repeat(np.arange(len(members)), counts)
-        arrays = (jnp.asarray(each, jnp.int32) for each in (source, blocks))
-        parts.append(Part(tuple(members), *arrays))
-    return tuple(parts)
-
-
 @eqx.filter_jit
-def _seen(parts: tuple[Part, ...], images, depths, sources, target, size) -> Seen:
+def _seen(parts: list[Any], target: Any, size: tuple[int, int]) -> Seen:
     """What all rays show, block after block."""
-    points = pixel_centers(*size).reshape(-1, 2)
-    found = []
-    for part in parts:
-        members = [(images[i], depths[i], sources[i]) for i in part.members]
+    points, found = pixel_centers(*size).reshape(-1, 2), []
+    for members, *of_each in parts:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
         def block(each, stacked=stacked):
@@ -201,12 +156,12 @@ def _seen(parts: tuple[Part, ...], images, depths, sources, target, size) -> See
             image, depth, camera = jax.tree.map(lambda x: x[source], stacked)
             rays = _Seen(target, points.at[pixels].get(mode="clip"), _OPTIONS)
             view, along, z = rays(depth, camera)
-            color = view.patch.read_colors(image).astype(images[0].dtype)
-            return Seen(pixels, color, view.mask, along, z)
+            return Seen(pixels, view.patch.read_colors(image), view.mask, along, z)
 
-        blocks = jax.lax.map(block, (part.source, part.pixels))
-        found.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), blocks))
-    return jax.tree.map(lambda *each: jnp.concatenate(each), *found)
+        rays = jax.lax.map(block, tuple(of_each))
+        found.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays))
+    joined = lambda *each: jnp.concatenate([x.astype(each[0].dtype) for x in each])
+    return jax.tree.map(joined, *found)
 
 
 @eqx.filter_jit

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxfx import FocusPlanes, ThinLens, budget, dof
-from jaxfx.budget.dof import Method
+from jaxfx.budget.dof import Method, _parts
 
 
 SIZE = (20, 24)
@@ -26,7 +26,7 @@ def scene(rng, widest):
         depth[card], image[card] = rng.uniform(1, 6), rng.uniform(0, 1, 3)
     lens = ThinLens(1.0, rng.uniform(1.5, 5), 1.0)
     largest = float(lens.circle_of_confusion(jnp.asarray(depth)).max())
-    lens = eqx.tree_at(lambda lens: lens.aperture, lens, jnp.asarray(widest / largest))
+    lens = eqx.tree_at(lambda lens: lens.aperture, lens, jnp.full((), widest / largest, float))
     return jnp.asarray(image), jnp.asarray(depth), lens
 
 
@@ -70,6 +70,27 @@ def test_no_error_allowed_is_the_effect_itself():
     plan = budget.dof(*data, max_error=0)
     assert plan.predicted_error == 0
     np.testing.assert_array_equal(plan(*data), dof.scatter(*data, max_coc=14.0))
+
+
+def test_a_plan_may_approach_the_layered_effect():
+    data = scene(np.random.default_rng(5), 13.9)
+    full = dof.layered(*data, max_coc=14.0)
+    plan = budget.dof(*data, max_error=0.03, target="layered")
+    error = float(np.sqrt(np.mean((plan(*data) - full) ** 2)))
+    assert error == pytest.approx(float(plan.predicted_error), rel=1e-6)
+    assert 0 < error <= 0.03
+    assert "what hides what, by scatter" in str(plan)
+
+
+def test_parts_of_a_large_picture_stand_for_it():
+    size = (640, 500)
+    image, depth = np.random.default_rng(6).uniform(1, 2, (*size, 3)), np.ones(size)
+    parts = _parts((image, depth, None), 10)
+    assert {part.data[0].shape for part in parts} == {(84, 84, 3)}
+    assert len({part.data[0][0, 0, 0] for part in parts}) == 9
+    np.testing.assert_array_equal(parts[-1].data[0], image[-84:, -84:])
+    assert parts[0].data[0][parts[0].core].shape == (64, 64, 3)
+    assert _parts((image[:300, :300], depth[:300, :300], None), 10) == []
 
 
 def test_a_flat_picture_of_large_circles_stays_flat_in_octaves():

@@ -2,13 +2,25 @@
 
 import inspect
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx import GBuffer, PinholeCamera, PointLight, budget, relight
+from jaxfx import (
+    AmbientLight,
+    DirectionalLight,
+    GBuffer,
+    PinholeCamera,
+    PointLight,
+    budget,
+    relight,
+)
+from jaxfx.budget._tiles import blocks
+from jaxfx.budget.relight import Merged, Tiled
 
 
-SIZE, COUNT = (8, 10), 8
+SIZE, COUNT = (8, 10), 5
 
 
 def scene(rng):
@@ -36,17 +48,77 @@ def test_no_plan_exceeds_its_error(plans):
 
 
 def test_the_error_allowed_is_made_use_of(plans):
-    plans.are_made_use_of(150)
+    plans.are_made_use_of(120)
 
 
 def test_a_plan_names_the_lights_that_it_drops():
     cache, camera, _ = scene(np.random.default_rng(1))
     place = [0.0, 0.0, 0.0]
     lights = [PointLight(place, [b, b, b]) for b in (3.0, 1e-4, 2.0, 0.0)]
-    plan = budget.relight(cache, camera, lights, max_error=1e-3)
-    assert plan.recipe.kept == (0, 2)
-    assert "light 1, for it brings" in str(plan)
-    assert "light 3, for it brings 0" in str(plan)
+    assert "lights 1, 3, " in str(budget.relight(cache, camera, lights, max_error=1e-3))
+
+
+def test_lights_are_computed_where_they_are_needed():
+    """Against the picture of each light times the pixels that it is for."""
+    rng = np.random.default_rng(2)
+    cache, camera, lights = scene(rng)
+    lights[3] = DirectionalLight([0.1, 0.2, 1.0], [0.3, 0.2, 0.1])
+    visibilities = [rng.uniform(0, 1, SIZE), None, rng.uniform(0, 1, SIZE), None, None]
+    where = rng.uniform(0, 1, (COUNT, *SIZE)) < 0.5
+    where[0] = True
+    parts = where.reshape(COUNT, -1) & (np.arange(COUNT) > 0)[:, None]
+    plan = Tiled((0,), (0, 2), blocks(parts, lights))
+    alone = [
+        relight.shade(cache, camera, light, visible) * mask.astype(float)[..., None]
+        for light, visible, mask in zip(lights, visibilities, where, strict=True)
+    ]
+    picture = plan(cache, camera, lights, visibilities)
+    np.testing.assert_allclose(picture, sum(alone), rtol=1e-9)
+
+
+def test_a_light_that_reaches_a_corner_is_computed_there_alone():
+    size = (24, 32)
+    flat = lambda *value: np.broadcast_to(np.array(value, float), (*size, len(value)))
+    gray, normal = flat(0.5, 0.5, 0.5), flat(0, 0, -1)
+    plane = lambda value: np.full(size, value)
+    cache = GBuffer(
+        gray, plane(0).astype(int), gray, gray, gray, normal, plane(4.0), plane(0.5)
+    )
+    camera = PinholeCamera.from_fov(1.0, height=24, width=32)
+    corner = camera.unproject(jnp.array([2.0, 2.0]), jnp.array(3.9))
+    lights = [PointLight([0, 0, 0], [4, 4, 4]), PointLight(corner, [0.01, 0.01, 0.01])]
+    plan = budget.relight(cache, camera, lights, max_error=2e-3)
+    assert "light 1 in 92% of their tiles" in str(plan)
+
+
+def test_shadows_that_take_nothing_away_need_no_map():
+    rng = np.random.default_rng(3)
+    cache, camera, lights = scene(rng)
+    visibilities = [np.ones(SIZE), rng.uniform(0, 1, SIZE), np.ones(SIZE), None, None]
+    full = relight.start(cache, camera, lights, visibilities=visibilities).image
+    plan = budget.relight(cache, camera, lights, visibilities, max_error=1e-4)
+    assert "shadows 0, 2, 0 at most" in str(plan)
+    without = plan(cache, camera, lights, [None, visibilities[1], None, None, None])
+    assert np.sqrt(np.mean((without - full) ** 2)) <= 1e-4
+
+
+def test_lights_in_one_place_become_one():
+    """Their sum is exact there: and so are ambient ones', anywhere."""
+    cache, camera, (near, far, *_) = scene(np.random.default_rng(4))
+    copies = [PointLight(near.position, near.color * share) for share in (0.5, 0.3, 0.2)]
+    ambient = [AmbientLight([0.1, 0.2, 0.3]), AmbientLight([0.3, 0.0, 0.1])]
+    plan = Merged(((0, 1, 2), (3,), (4, 5)), ())
+    lights = [*copies, far, *ambient]
+    picture = lambda brighter: plan(
+        cache, camera, [PointLight(near.position, near.color * 0.5 * brighter), *lights[1:]]
+    )
+    full = relight.render(cache, camera, [near, far, AmbientLight([0.4, 0.2, 0.4])])
+    np.testing.assert_allclose(picture(1.0), full, rtol=1e-9)
+    slope = jax.jvp(picture, (1.0,), (1.0,))[1]
+    alone = relight.shade(cache, camera, copies[0])
+    np.testing.assert_allclose(slope, alone, rtol=1e-9)
+    found = budget.relight(cache, camera, copies, max_error=1e-9)
+    assert "what 3 lights have beyond 1 merged ones" in str(found)
 
 
 def test_a_negative_error_is_refused():
