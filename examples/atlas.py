@@ -2,9 +2,10 @@
 
 Measures the methods of depth of field, blur, reprojection, ray search, shadows and relighting,
 and the plans of `budget`, at several settings on two scenes each, the second made to fail.
-Writes `atlas.csv`, a row for each measurement, `machine.txt`, and for each effect the charts of
-time and of memory against error, on each scene, and of time and error against the size of the
-picture and against the effect's own size, as PNG and SVG. Nothing else should run meanwhile.
+Writes `atlas.csv`, a row for each measurement, `atlas.txt`, the machine, and for each effect
+the charts of time and of memory against error, on each scene, and of time and error against the
+size of the picture and against the effect's own size, as PNG and SVG. Nothing else should run
+meanwhile.
 """
 
 import argparse
@@ -16,12 +17,13 @@ import itertools
 import math
 import os
 import platform
+import re
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, NoReturn, get_args
+from typing import Any, NamedTuple, NoReturn, get_args
 
 import atlas_cases
 import jax
@@ -35,6 +37,7 @@ from jaxfx.exr.layers import write_whole
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator
 
 
 # A picture this near to the reference is drawn as this near: it differs by rounding.
@@ -63,7 +66,7 @@ EFFECTS = {
         16,
         (4, 8, 16, 32),
         "circles of confusion up to {} pixels",
-        "128 passes through the lens, 16 if quick",
+        "128 passes through the lens, 16 if quick; all but multi-pass are given a picture",
     ),
     "blur": Effect(
         "blur",
@@ -80,10 +83,10 @@ EFFECTS = {
         atlas_cases.warped,
         (STILL, FENCE),
         "turn of the camera (degrees)",
-        6,
+        3,
         (1, 3, 6, 12),
         "camera turned by {} degrees",
-        "the mesh seen from there, in the pixels that the first source saw",
+        "the mesh seen from there; holes count as right, so who draws less errs less",
     ),
     "intersect": Effect(
         "ray search",
@@ -175,8 +178,8 @@ def measure(key: str, arguments, bar) -> list[Row]:
                     {f"{method} {setting}": call},
                     case.truth,
                     mask=case.counted,
-                    repeats=3 if arguments.quick else 7,
-                    max_seconds=0.5,
+                    repeats=3 if arguments.quick else 11,
+                    max_seconds=0.4,
                     memory=not isinstance(function, OnHost),
                     progress=False,
                 )
@@ -202,26 +205,20 @@ def write_rows(rows: list[Row], path: Path) -> None:
 def read_rows(path: Path) -> list[Row]:
     """What `write_rows` wrote."""
     kinds = Row.__annotations__
-
-    def value(field, text):
-        return float(text or "nan") if kinds[field] is float else kinds[field](text)
-
+    value = lambda field, text: kinds[field](
+        "nan" if text == "" and kinds[field] is float else text
+    )
     with open(path, newline="", encoding="utf-8") as file:
-        return [
-            Row._make(value(field, line[field]) for field in Row._fields)
-            for line in csv.DictReader(file)
-        ]
+        lines = list(csv.DictReader(file))
+    return [Row._make(value(field, line[field]) for field in Row._fields) for line in lines]
 
 
 def machine() -> str:
     """What the times depend on."""
     try:
-        (name, *_) = (
-            line.split(":")[1].strip()
-            for line in Path("/proc/cpuinfo").read_text().splitlines()
-            if line.startswith("model name")
-        )
-    except (OSError, ValueError):
+        found = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
+        name = found[1] if found else platform.machine()
+    except OSError:
         name = platform.processor() or platform.machine()
     versions = [f"{one} {importlib.metadata.version(one)}" for one in ("jaxfx", "jax", "numpy")]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -277,7 +274,7 @@ def draw_errors(rows: list[Row], effect: Effect, cost: tradeoff.Cost, note: str)
     return figure
 
 
-def draw_growth(rows: list[Row], effect: Effect, along: str, label: str, note: str):
+def draw_growth(rows: list[Row], *, effect: Effect, along: str, label: str, note: str):
     """The usual setting of every method: time and error along a size."""
     figure, axes = plt.subplots(1, 2, figsize=(9.5, 4.6), layout="constrained")
     value = lambda row: getattr(row, along)
@@ -298,7 +295,9 @@ def draw_growth(rows: list[Row], effect: Effect, along: str, label: str, note: s
         ax.set_xlabel(label)
         ax.grid(alpha=0.3)
     axes[0].set_yscale("log")
+    axes[0].yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     axes[0].yaxis.set_major_formatter("{x:g}")
+    axes[0].yaxis.set_minor_formatter("{x:g}")
     axes[0].set_ylabel("time of a picture (ms, median)")
     axes[1].set_ylabel("PSNR to the reference (dB)")
     row = rows[0]
@@ -315,29 +314,35 @@ def write_margin(figure, note: str) -> None:
     figure.supxlabel(note, **style)
 
 
-def draw(rows: list[Row], key: str, folder: Path, where: str) -> list[str]:
-    """All charts of an effect; their names."""
+def charts(rows: list[Row], key: str, where: str) -> dict[str, Callable[[], Any]]:
+    """What draws each figure of an effect, by name."""
     effect, rows = EFFECTS[key], [row for row in rows if row.effect == key]
-    first = rows[0]
-    note = f"reference: {effect.truth}; {EXACT:g} dB stands for that and more\n{where}"
+    first, note = rows[0], f"reference: {effect.truth}\n{where}"
+    if max(row.psnr for row in rows) > EXACT:
+        note = f"{EXACT:g} dB stands for that and more; {note}"
     figures = {}
     for scene, cost in itertools.product(effect.scenes, get_args(tradeoff.Cost)):
         there = [row for row in rows if row.at == (scene, first.height, effect.usual)]
         name = f"{key}_{cost}_{scene}".replace("seconds", "time").replace(" ", "_")
-        figures[name] = draw_errors(there, effect, cost, note)
+        figures[name] = functools.partial(draw_errors, there, effect, cost, note)
     # The usual setting of a method comes first at each point.
     usual = {(row.method, row.at): row for row in reversed(rows) if row.scene == first.scene}
     usual = list(usual.values())[::-1]
     sizes = [row for row in usual if row.own == effect.usual]
     owns = [row for row in usual if row.height == first.height]
+    growth = functools.partial(draw_growth, effect=effect, note=note)
     side = "side of the picture (pixels)"
-    figures[f"{key}_size"] = draw_growth(sizes, effect, "width", side, note)
-    figures[f"{key}_own"] = draw_growth(owns, effect, "own", effect.own, note)
-    for name, figure in figures.items():
+    figures[f"{key}_size"] = functools.partial(growth, sizes, along="width", label=side)
+    figures[f"{key}_own"] = functools.partial(growth, owns, along="own", label=effect.own)
+    return figures
+
+
+def save(figures: dict[str, Callable[[], Any]], folder: Path) -> None:
+    for name, draw in figures.items():
+        figure = draw()
         for kind in ("png", "svg"):
             tradeoff.save(figure, folder / f"{name}.{kind}")
         plt.close(figure)
-    return list(figures)
 
 
 # --- The command
@@ -382,9 +387,9 @@ def make_folder(folder: Path) -> Path:
 def earlier(path: Path) -> tuple[list[Row], str]:
     """The rows of an earlier run and where it was made."""
     try:
-        return read_rows(path), path.with_name("machine.txt").read_text().strip()
+        return read_rows(path), path.with_suffix(".txt").read_text().strip()
     except (OSError, KeyError, TypeError, ValueError) as error:
-        fail(f"--csv must be a file that this command wrote, machine.txt beside it: {error!r}")
+        fail(f"--csv must be a file that this command wrote, with its .txt: {error!r}")
 
 
 def main() -> None:
@@ -397,14 +402,16 @@ def main() -> None:
         keys = [key for key in keys if key in {row.effect for row in rows}]
     else:
         rows, where = [], machine()
-        write_whole(out / "machine.txt", f"{where}\n".encode())
+        write_whole(out / "atlas.txt", f"{where}\n".encode())
     total = sum(len(points(EFFECTS[key], arguments)) for key in keys)
     with tqdm(total=total, unit="point", disable=arguments.csv is not None) as bar:
         for key in keys:
             if not arguments.csv:
                 rows += measure(key, arguments, bar)
                 write_rows(rows, out / "atlas.csv")
-            names += draw(rows, key, out, where)
+            figures = charts(rows, key, where)
+            save(figures, out)
+            names += figures
     seconds = time.perf_counter() - started
     print(f"{len(rows)} measurements, {len(names)} charts in {out}, {seconds:.0f} s")
 

@@ -163,7 +163,7 @@ def depth_of_field(at: Point) -> Case:
             ),
         },
         "gather": {f"{n} taps": of(dof.gather, taps=n) for n in (32, 8, 128)},
-        "depth sorted": {f"{n}": of(dof.depth_sorted, slices=n) for n in (8, 4, 16)},
+        "depth sorted": {f"{n} slices": of(dof.depth_sorted, slices=n) for n in (8, 4, 16)},
         "blend": {"": of(dof.blend)},
         "separable": {"": of(dof.separable)},
         "anisotropic diffusion": {"": of(dof.anisotropic_diffusion)},
@@ -180,13 +180,13 @@ def depth_of_field(at: Point) -> Case:
 def plans(
     plan: Callable[..., Any],
     given: Callable[..., Any],
-    picture: Callable[[Any], Any] = lambda result: result,
+    picture: Callable[..., Any] = lambda result, *data: result,
 ) -> dict[str, Planned]:
     """A plan for each of two errors, made for and called with what it is given of the data."""
 
     def make(error, *data):
         found = plan(*given(*data), max_error=error)
-        return lambda *data: picture(found(*given(*data)))
+        return lambda *data: picture(found(*given(*data)), *data)
 
     return {f"{error:g}": Planned(functools.partial(make, error)) for error in (0.01, 0.03)}
 
@@ -254,26 +254,16 @@ def warped(at: Point) -> Case:
             images[:count], depths[:count], cameras[:count], target
         )
     )
-    picture = lambda call: lambda *data: call(*data)[0]
+    # What is a hole is known to be one, and counts as right.
+    over = lambda drawn, *data: jnp.where(drawn[1][..., None] > 0, drawn[0], data[-1])
+    picture = lambda call: lambda *data: over(call(*data[:4]), *data)
     methods = {f"warp, {name}": {"": picture(of(name))} for name in SEARCHES} | {
         "blend": {f"{count} sources": picture(few(count)) for count in (2, 4)},
-        "plan": plans(budget.reproject, lambda *data: data, lambda result: result[0]),
+        "plan": plans(budget.reproject, lambda *data: data[:4], over),
     }
-    data = (list(images), [buffer.depth for buffer in buffers], cameras, target)
-    truth, there = render(target)
-    return Case(data, truth, methods, seen(there.depth, target, gbuffer.depth, camera))
-
-
-def seen(depth, camera, other_depth, other) -> np.ndarray:
-    """The pixels whose points another camera sees too, by both cameras' depth."""
-    known = jnp.isfinite(depth)
-    height, width = depth.shape
-    pixels = pixel_centers(height, width, depth.dtype)
-    spots, z = other.project(camera.unproject(pixels, jnp.where(known, depth, 1)))
-    column, row = np.moveaxis(np.asarray(spots), -1, 0).astype(int)
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    nearest = np.asarray(other_depth)[row * inside, column * inside]
-    return inside & np.asarray(known) & (np.abs(np.asarray(z) / nearest - 1) < 0.03)
+    truth, _ = render(target)
+    data = (list(images), [buffer.depth for buffer in buffers], cameras, target, truth)
+    return Case(data, truth, methods)
 
 
 SEARCHES = ("pyramid", "descent", "linear", "relief")
@@ -299,11 +289,11 @@ def searched(at: Point) -> Case:
 
         return call
 
-    every = {"descent": (at.own, 4, 6)}  # Its steps are levels.
     methods = {
-        name: {f"{n}": of(name, n) for n in every.get(name, (at.own, 8, 16, 128))}
-        for name in SEARCHES
+        name: {f"{n}": of(name, n) for n in dict.fromkeys((at.own, 8, 16, 128))}
+        for name in ("pyramid", "linear", "relief")
     }
+    methods["descent"] = {"": of("descent", None)}  # Its levels are all or nothing.
     data = tuple(jnp.asarray(array, jnp.float32) for array in (depth, origin, direction))
     return Case(data, of("pyramid", None)(*data), methods)
 
@@ -348,7 +338,7 @@ def shadowed(at: Point) -> Case:
         "prefiltered": several(shadow.prefiltered),
         "variance": several(shadow.variance),
         "pcss": several(shadow.pcss, light_size=lamp),
-        "plan": plans(plan, lambda *data: data[:2], lambda result: result[..., None]),
+        "plan": plans(plan, lambda *data: data[:2], lambda result, *_: result[..., None]),
     }
     data, counted = (shadow_map, receivers, eye), np.asarray(known) & inside & facing
     return Case(data, lit.mean(axis=0, dtype=np.float32)[..., None], methods, counted)
@@ -413,8 +403,8 @@ def relit(at: Point) -> Case:
                 data["dull"].paint(data["paint"][0], roughness=data["paint"][2]).image
             ),
         },
-        "new view": {f"{n} caches": new_view(n) for n in (4, 1, 2)}
-        | {"4, by detail": new_view(4, weights="detail")},
+        "new view": {f"from {n}": new_view(n) for n in (4, 1, 2)}
+        | {"from 4, by detail": new_view(4, weights="detail")},
         "plan": plans(budget.relight, lambda data: data["of"]),
     }
     return Case((data,), relight.render(*data["of"]), methods)

@@ -252,13 +252,17 @@ def plot(
 
 
 def _scale(ax: "Axes", costs: Sequence[float]) -> None:
-    """Logarithmic, or linear below the smallest if there is a 0."""
-    if 0 not in costs:
-        ax.set_xscale("log")
-    else:
+    """Logarithmic, or linear below the smallest if there is a 0; with plain numbers."""
+    from matplotlib.ticker import LogLocator
+
+    if 0 in costs:
         least = min((x for x in costs if x > 0), default=1.0)
         threshold = 10 ** math.floor(math.log10(least))
         ax.set_xscale("symlog", linthresh=threshold, linscale=0.4)
+    else:
+        ax.set_xscale("log")
+        ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        ax.xaxis.set_minor_formatter("{x:g}")
     ax.xaxis.set_major_formatter("{x:g}")
 
 
