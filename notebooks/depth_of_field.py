@@ -20,9 +20,7 @@
 
 # %%
 import functools as ft
-import json
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -193,57 +191,10 @@ plt.show()
 # %% [markdown]
 # ## Where they fail
 #
-# Every method on the same cases, each with a truth in closed form: `tests/dof/failures.json`,
-# which the tests hold every method to. Red is worse than what a case asks for, the first row;
-# the empty ones don't apply.
-#
-# - *constant*: largest error on a constant picture over any depth.
-# - *slanted plane*: an opaque plane through focus; rms error.
-# - *energy*, *centroid*, *second moment*: of the picture of a point, a disc of radius 4.5.
-# - *jump*: as the radius goes from 0 to 2 pixels, the largest change of a step over that of one
-#   twice as long: a half for a slope, 1 for a jump. *unevenness*: over the mean change.
-# - *blurred foreground*, *sharp foreground*: rms error in the band about an edge.
-# - *thin bar*: bars of 1 to 3 pixels in focus before a bright field; rms error about them.
-# - *highlight*: relative error of dim pixels near one of 1e6, in float32.
-# - *reach of a NaN*: how far a bad pixel spoils others, with a radius of 6.
-# - *gradient*: how far derivatives lie outside both one-sided difference quotients.
-# - *not finite*: values that are, for depths of 0, 1e-30 and 1e30.
-
-# %%
-published = json.loads(Path("../tests/dof/failures.json").read_text())
-table = {"passes up to": dof_cases.PASSES} | published
-cells, colors = [], []
-for name, row in table.items():
-    figures = [row.get(case) for case in dof_cases.PASSES]
-    limits = dof_cases.PASSES.values()
-    cells.append(["" if f is None else f"{f:.2g}" for f in figures])
-    is_wrong = [f is not None and f > limit for f, limit in zip(figures, limits, strict=True)]
-    right = "0.92" if name == "passes up to" else "#e3f1e3"
-    shades = zip(figures, is_wrong, strict=True)
-    colors.append(["#f6c6c0" if w else "white" if f is None else right for f, w in shades])
-
-figure, ax = plt.subplots(figsize=(13, 0.32 * len(table) + 0.6), layout="constrained")
-ax.set_axis_off()
-drawn = ax.table(
-    cells,
-    cellColours=colors,
-    rowLabels=list(table),
-    colLabels=[case.replace(" ", "\n", 1) for case in dof_cases.PASSES],
-    loc="center",
-    cellLoc="center",
-)
-drawn.auto_set_font_size(False)
-drawn.set_fontsize(9)
-drawn.scale(1, 1.3)
-for (row, _), cell in drawn.get_celld().items():
-    if row == 0:
-        cell.set_height(cell.get_height() * 1.8)
-plt.show()
-
-# %% [markdown]
-# The cases with something to see, 46 pixels wide: a white half-plane before a black one, both
-# ways; a dim bar of 3 pixels before a bright field; a slanted plane. The last row is the
-# multi-pass reference, the line below each picture its middle row, over the truth.
+# `stability.ipynb` has the figures of every method in every case, to which the tests hold them.
+# Here are the cases with something to see, 46 pixels wide: a white half-plane before a black
+# one, both ways; a dim bar of 3 pixels before a bright field; a slanted plane. The last row is
+# the multi-pass reference, the line below each picture its middle row, over the truth.
 
 # %%
 cases = {name: several[-1] for name, several in dof_cases.scenes().items()}

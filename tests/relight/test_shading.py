@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from relight_views import FRONT, REFLECTANCES, one_pixel, sun
 
 from jaxfx import (
     AmbientLight,
@@ -27,7 +28,6 @@ LIGHTS = {
     "point": PointLight([-0.6, -0.9, 0.2], [3.0, 2.0, 1.0]),
     "spot": SpotLight([0.4, -0.5, 0.1], [-0.4, 0.3, 2.0], [3.0, 4.0, 5.0], 0.05, 0.7),
 }
-REFLECTANCES = ("color", "ambient", "diffuse", "specular")
 
 
 def make_camera(kind, height, width):
@@ -53,22 +53,6 @@ def make_gbuffer(seed, height=7, width=9, background=True):
         depth=np.where(shader == -1, np.inf, rng.uniform(1.5, 4, shape)),
         roughness=rng.uniform(0.3, 0.9, shape),
     )
-
-
-def one_pixel(shader=0, *, normal=(0, 0, -1), depth=1.0, roughness=0.5):
-    """A grey pixel on the axis of `FRONT`, at (0, 0, depth)."""
-    fields = zip(REFLECTANCES, (1, 0.1, 0.5, 0.25), strict=True)
-    return GBuffer(
-        **{name: np.full((1, 1, 3), float(value)) for name, value in fields},
-        shader=np.full((1, 1), shader),
-        normal=np.full((1, 1, 3), normal, float),
-        depth=np.full((1, 1), float(depth)),
-        roughness=np.full((1, 1), float(roughness)),
-    )
-
-
-# A camera at the origin whose only pixel looks along z.
-FRONT = PinholeCamera([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], np.eye(4))
 
 
 def cast(tree, dtype):
@@ -149,55 +133,6 @@ def test_equals_the_loop(camera, light, shader):
     np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-13)
 
 
-def sun(*direction):
-    return DirectionalLight(direction, [4, 8, 12])
-
-
-SLANTED = (np.sqrt(0.75), 0, 0.5)  # Sixty degrees off the axis.
-LAMP = PointLight([0, 0, 0], [4, 8, 12])
-AHEAD = SpotLight([0, 0, 0], [0, 0, 1], [4, 8, 12], 0, 1)
-CLOSED = eqx.tree_at(lambda spot: spot.outer_angle, AHEAD, AHEAD.inner_angle)
-
-
-@pytest.mark.parametrize(
-    ("gbuffer", "light", "expected"),
-    [
-        (one_pixel(), AmbientLight([4, 8, 12]), 0.1),
-        (one_pixel(), sun(0, 0, 5), 0.5),
-        (one_pixel(), sun(*SLANTED), 0.25),
-        (one_pixel(), sun(0, 0, -1), 0),
-        # Twice as far, a quarter. The lamp is at the eye, so the highlight is full.
-        (one_pixel(depth=2), LAMP, 0.5 / 4),
-        (one_pixel(1, depth=2), LAMP, 0.75 / 4),
-        (one_pixel(2, depth=2), LAMP, 0.75 / 4),
-        # n = 6. Phong's angle is 60 degrees, its cosine to the sixth 1 / 64; Blinn's is 30.
-        (one_pixel(1), sun(*SLANTED), 0.25 + 0.25 / 64),
-        (one_pixel(2), sun(*SLANTED), 0.25 + 0.25 * 27 / 64),
-        # Light against the view has no direction halfway.
-        (one_pixel(2, normal=(0, 0, 1)), sun(0, 0, -1), 0.5),
-        (one_pixel(1, roughness=0), LAMP, 0.75),
-        (one_pixel(2, roughness=0), LAMP, 0.75),
-        (one_pixel(1, roughness=0), sun(*SLANTED), 0.25),
-        (one_pixel(2, roughness=0), sun(*SLANTED), 0.25),
-        # The length of a normal, which a file may round, is not brightness.
-        (one_pixel(2, normal=(0, 0, -1.01)), LAMP, 0.75),
-        # A cone whose border goes from 0 to 90 degrees: at 60, s is 1 / 2.
-        (one_pixel(), SpotLight([0, 0, 0], SLANTED, [4, 8, 12], 0, np.pi / 2), 0.25),
-        (one_pixel(), SpotLight([0, 0, 0], [1, 0, 1], [4, 8, 12], 0.8, 0.9), 0.5),
-        (one_pixel(), SpotLight([0, 0, 0], [1, 0, 1], [4, 8, 12], 0.6, 0.7), 0),
-        (one_pixel(), CLOSED, 0),
-        (one_pixel(-1, depth=np.inf), AmbientLight([4, 8, 12]), 0),
-        (one_pixel(-1), AmbientLight([np.inf] * 3), 0),
-        (one_pixel(2, depth=np.inf), LAMP, 0),
-        (one_pixel(1, normal=(0, 0, 0)), LAMP, 0),
-        (one_pixel(1, normal=(0, 0, 1)), LAMP, 0),
-    ],
-)
-def test_pixels_made_by_hand(gbuffer, light, expected):
-    result = relight.shade(gbuffer, FRONT, light)
-    np.testing.assert_allclose(result[0, 0], expected * np.array([4, 8, 12]), rtol=1e-12)
-
-
 @each_light
 @each_camera
 def test_both_modes_equal_finite_differences(camera, light):
@@ -234,51 +169,6 @@ def test_both_modes_equal_finite_differences(camera, light):
     np.testing.assert_allclose(forward, sum(jax.tree.leaves(products)), rtol=1e-10)
     if isinstance(light, PointLight | SpotLight):
         assert still == {"color", "ambient"}
-
-
-DEGENERATE = {
-    "light in the surface's plane": (one_pixel(1), sun(1, 0, 0)),
-    "mirror image across the view": (
-        one_pixel(1, normal=(np.sqrt(0.5), 0, -np.sqrt(0.5)), roughness=0.9),
-        sun(0, 0, 1),
-    ),
-    "light against the view": (one_pixel(2), sun(0, 0, -1)),
-    "light against the view, seen": (one_pixel(2, normal=(0, 0, 1)), sun(0, 0, -1)),
-    "roughness 0 at the peak": (one_pixel(2, roughness=0), LAMP),
-    "roughness 0 off the peak": (one_pixel(1, roughness=0), sun(*SLANTED)),
-    "roughness 1e-6": (one_pixel(2, roughness=1e-6), PointLight([1e-7, 0, 0], [1, 1, 1])),
-    "roughness 1": (one_pixel(1, roughness=1), sun(*SLANTED)),
-    "light at the surface": (one_pixel(2), PointLight([0, 0, 1], [1, 1, 1])),
-    "light just off it": (one_pixel(1), PointLight([0, 0, 1 - 1e-6], [1, 1, 1])),
-    "spot at the surface": (one_pixel(1), SpotLight([0, 0, 1], [0, 0, 1], [1, 1, 1], 0, 1)),
-    "spot on its axis": (one_pixel(1), AHEAD),
-    "spot turned away": (one_pixel(1), SpotLight([0, 0, 0], [0, 0, -1], [1, 1, 1], 0, np.pi)),
-    "spot that closes": (one_pixel(1), CLOSED),
-    "zero normal": (one_pixel(1, normal=(0, 0, 0)), LAMP),
-    "background": (one_pixel(-1, normal=(0, 0, 0), depth=np.inf, roughness=0), LAMP),
-    "a surface infinitely far": (one_pixel(2, depth=np.inf), LAMP),
-}
-
-
-@jax.jit
-def value_slope_and_curvature(arguments, shader):
-    """What a pixel shows, its derivatives, and theirs along one direction."""
-
-    def score(arguments):
-        floats, *others = arguments
-        return jnp.sum(relight.shade(eqx.combine(floats, shader), *others))
-
-    along = jax.tree.map(lambda leaf: jnp.cos(7 * leaf + 1), arguments)
-    along = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 1), along)
-    return jax.jvp(jax.value_and_grad(score), (arguments,), (along,))
-
-
-@pytest.mark.parametrize(("gbuffer", "light"), DEGENERATE.values(), ids=DEGENERATE.keys())
-def test_two_derivatives_are_finite_even_in_float32_at_degenerate_points(gbuffer, light):
-    floats, shader = eqx.partition(gbuffer, eqx.is_inexact_array)
-    arguments = cast((floats, FRONT, light), np.float32)
-    for leaf in jax.tree.leaves(value_slope_and_curvature(arguments, shader)):
-        assert np.isfinite(leaf).all()
 
 
 @pytest.mark.parametrize("shader", [1, 2])

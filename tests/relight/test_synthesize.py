@@ -1,4 +1,5 @@
-"""New views against a plain loop, against fresh caches, and where two surfaces might blend."""
+"""New views against a plain loop. (Against fresh caches, and where two surfaces might blend:
+`tests/stability`.)"""
 
 import functools
 import inspect
@@ -8,38 +9,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from relight_views import (
+    BLUE,
+    CAMERAS,
+    FRONTAL,
+    HEIGHT,
+    RED,
+    SIZE,
+    TARGET,
+    WIDTH,
+    cache,
+    orbit,
+    pinhole,
+    plane,
+    points,
+)
 
-from jaxfx import GBuffer, OrthographicCamera, PinholeCamera, metrics, relight, scene
+from jaxfx import OrthographicCamera, PinholeCamera, relight
 
 
 quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
-SIZE = HEIGHT, WIDTH = 24, 32
-MESH = scene.still_life()
-CENTRE = np.array(MESH.viewpoint.target)
-EYE = np.array(MESH.viewpoint.eye)
 FLOATS = ("color", "ambient", "diffuse", "specular", "roughness", "normal")
-
-
-def orbit(degrees, raised=0.0, size=SIZE):
-    """A camera about the still life's centre, turned to the side and raised."""
-    angle = np.radians(degrees)
-    turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    eye = CENTRE + turn @ (EYE - CENTRE) + [0, raised, 0]
-    size = {"height": size[0], "width": size[1]}
-    return PinholeCamera.look_at(eye, CENTRE, up=[0, 1, 0], fov_y=0.8, **size)
-
-
-def cache(camera, size=SIZE):
-    return scene.gbuffer(MESH, camera, height=size[0], width=size[1], backend="embree")
-
-
-def points(camera, depth):
-    """The world's points that a camera sees at a depth, in NumPy."""
-    depth = jnp.asarray(depth)
-    columns, rows = (jnp.arange(0.5, side) for side in depth.shape[::-1])
-    pixels = jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
-    return np.asarray(camera.unproject(pixels, depth))
 
 
 def loop(gbuffers, cameras, target, depth, field, tolerance):
@@ -66,37 +57,6 @@ def loop(gbuffers, cameras, target, depth, field, tolerance):
         coverage[j, i] = len(values)
         image[j, i] = np.mean(values, axis=0) if values else 0
     return image, coverage
-
-
-def plane(normal, *, size=SIZE, shader=0, offset=0.0):
-    """Caches of a plane through (0, 0, 3), in closed form; its colours are the camera's own."""
-    normal = np.asarray(normal, float) / np.linalg.norm(normal)
-
-    def of(camera, color=None):
-        rng = np.random.default_rng([*np.asarray(camera.world_from_camera).tobytes()])
-        near, far = (points(camera, np.full(size, depth)) for depth in (1.0, 2.0))
-        rate = (far - near) @ normal
-        depth = 1 + (np.array([0, 0, 3.0 + offset]) - near) @ normal / rate
-        image = rng.uniform(0.2, 1, (*size, 3)) if color is None else np.full((*size, 3), color)
-        facing = normal * -np.sign(rate)[..., None]
-        return GBuffer(
-            *(image, np.full(size, shader), image, image, image, facing),
-            depth=np.where(depth > 0, depth, np.inf),
-            roughness=image[..., 0],
-        )
-
-    return of
-
-
-def pinhole(x=0.0, y=0.0):
-    return PinholeCamera.look_at(
-        [x, y, 0], [0, 0, 3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
-    )
-
-
-FRONTAL = plane([0, 0, -1])
-CAMERAS = [pinhole(-0.4), pinhole(0.3, 0.2), pinhole(0.1, -0.3)]
-TARGET = pinhole(0.05, 0.04)
 
 
 def test_the_same_camera_gives_the_same_cache():
@@ -152,11 +112,7 @@ def test_an_oblique_plane_is_seen_whole_although_its_depth_is_steep():
     assert (np.asarray(coverage) > 0)[near].mean() > 0.9
 
 
-# --- New views of the still life.
-
-
-def psnr(image, reference, mask=None):
-    return float(metrics.psnr(image, reference, mask=mask))
+# --- Several caches.
 
 
 LARGE = (96, 128)
@@ -178,120 +134,7 @@ def caches():
     return [cache(camera, LARGE) for camera in cameras], cameras
 
 
-def new_view(caches, count, degrees):
-    gbuffers, cameras = (each[:count] for each in caches)
-    target = orbit(degrees, 0.1, LARGE)
-    truth = cache(target, LARGE)
-    found, coverage = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
-    return target, truth, found, np.asarray(coverage)
-
-
-@pytest.mark.parametrize("degrees", [5, 15, 30])
-def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
-    """PSNR of every parameter, ids exact, and the relit picture, filled and outside holes."""
-    shares = []
-    for count in (1, 2, 4, 8):
-        target, truth, found, coverage = new_view(caches, count, degrees)
-        shown = np.asarray(truth.shader) >= 0
-        seen = coverage > 0
-        assert not seen[~shown].any() and coverage.max() <= count
-        shares.append(seen[shown].mean())
-        assert set(np.unique(found.shader)) <= {-1, 0, 2}
-        wrong = np.asarray(found.shader != truth.shader)[seen]
-        assert wrong.mean() < 0.005
-        for name in ("color", "diffuse", "specular", "normal"):
-            assert psnr(getattr(found, name), getattr(truth, name), seen) > 18, name
-        np.testing.assert_array_equal(found.depth, truth.depth)
-        length = np.linalg.norm(np.asarray(found.normal), axis=-1)
-        np.testing.assert_allclose(length, seen, atol=1e-5)
-
-        filled, holes = relight.fill_holes(found, coverage)
-        assert int(holes) == (shown & ~seen).sum()
-        assert (np.asarray(filled.shader)[shown] >= 0).all()
-        lights = scene.default_lights(target)
-        pictures = [relight.render(each, target, lights) for each in (truth, found, filled)]
-        assert psnr(pictures[2], pictures[0]) >= psnr(pictures[1], pictures[0])
-        assert psnr(pictures[1], pictures[0], seen) > 20
-    assert shares == sorted(shares) and shares[0] > 0.4
-    assert shares[-1] > {5: 0.98, 15: 0.95, 30: 0.8}[degrees]
-
-
-# --- Two surfaces must not blend.
-
-
-def spread(values):
-    """The largest distance of a pixel's colour from the nearest of the two pure ones."""
-    values = np.asarray(values)
-    return np.minimum(np.abs(values - RED).max(-1), np.abs(values - BLUE).max(-1)).max()
-
-
-RED, BLUE = np.array([0.9, 0.1, 0.1]), np.array([0.1, 0.1, 0.9])
-
-
-def split_view(one, other, camera, edge):
-    """A cache that shows one plane left of the world's `x = edge` on it, the other right."""
-    left, right = one(camera), other(camera)
-    x = points(camera, left.depth)[..., 0]
-    choose = lambda a, b: np.where((x < edge).reshape(x.shape + (1,) * (a.ndim - 2)), a, b)
-    return jax.tree.map(choose, left, right)
-
-
-def of_color(plane_of, color):
-    return lambda camera: plane_of(camera, color=color)
-
-
-def check_no_blend(one, other, tolerance=0.005, edge=0.1):
-    """No colour but the two, and each where its plane is, save half a pixel about the edge."""
-    one, other = of_color(one, RED), of_color(other, BLUE)
-    gbuffers = [split_view(one, other, camera, edge) for camera in CAMERAS]
-    truth = split_view(one, other, TARGET, edge)
-    found, coverage = relight.synthesize(
-        gbuffers, CAMERAS, TARGET, depth=truth.depth, tolerance=tolerance
-    )
-    covered = np.asarray(coverage) > 0
-    assert covered.mean() > 0.9
-    assert spread(np.asarray(found.color)[covered]) < 1e-6
-    wrong = (np.abs(np.asarray(found.color - truth.color)).max(-1) > 1e-6) & covered
-    assert wrong.sum() <= HEIGHT
-    np.testing.assert_array_equal(
-        found.shader[covered & ~wrong], truth.shader[covered & ~wrong]
-    )
-
-
-def test_a_cliff_does_not_blend():
-    check_no_blend(FRONTAL, plane([0, 0, -1], offset=1.0))
-
-
-def test_close_surfaces_of_two_shaders_do_not_blend():
-    """0.3 of the tolerance apart."""
-    check_no_blend(FRONTAL, plane([0, 0, -1], offset=0.0045, shader=2))
-
-
-def test_close_surfaces_do_not_blend_where_a_cache_fits_better():
-    check_no_blend(FRONTAL, plane([0, 0, -1], offset=0.0045))
-
-
-def test_close_surfaces_of_two_normals_do_not_blend():
-    check_no_blend(FRONTAL, plane([0.7, 0, -1], offset=0.0), edge=0.0)
-
-
-def test_a_thin_sheet_seen_from_both_sides_has_the_normal_that_faces_the_camera():
-    """Mirrored normals: their mean would be nothing."""
-    behind = PinholeCamera.look_at(
-        [0, 0, 6], [0, 0, 3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
-    )
-    front = FRONTAL(CAMERAS[0], color=RED)
-    back = FRONTAL(behind, color=BLUE)
-    assert float(back.normal[0, 0, 2]) == 1
-    depth = FRONTAL(TARGET).depth
-    for order in ([0, 1], [1, 0]):
-        pairs = [((front, CAMERAS[0]), (back, behind))[i] for i in order]
-        found, coverage = relight.synthesize(*zip(*pairs, strict=True), TARGET, depth=depth)
-        covered = np.asarray(coverage) > 0
-        assert covered.mean() > 0.5
-        assert np.asarray(coverage).max() == 1
-        np.testing.assert_allclose(np.asarray(found.color)[covered] - RED, 0, atol=1e-12)
-        np.testing.assert_allclose(np.asarray(found.normal)[covered][:, 2], -1)
+# --- Surfaces that differ.
 
 
 def test_ids_are_never_averaged():

@@ -1,90 +1,20 @@
-"""The search against a walk over every texel; where the quick methods fail, and how often."""
+"""The search: its steps, its surfaces, its derivatives. Its hits, and where the quick methods
+fail, are held to a walk over every texel in `tests/stability`."""
 
 import inspect
-import itertools
-import math
 import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reproject_cases import cliff, error_rate, posts, run, slanted_rays, smooth
+from reproject_cases import run, slanted_rays
+from reproject_failures import awkward_rays, field, grid_walk
 
 from jaxfx.reproject import intersect
 
 
-SIZES = [(1, 1), (2, 3), (5, 5), (17, 61), (64, 64), (257, 64)]
 METHODS = ("pyramid", "descent", "linear", "relief")
-
-
-def grid_walk(depth, origin, direction):
-    """The time of the first t >= 0 with z(t) >= depth[floor y, floor x]; None for a miss.
-
-    All crossings are sorted. A ray towards larger coordinates is in the next texel at the
-    crossing (key 0), one towards smaller coordinates just after it (key 1).
-    """
-    height, width = depth.shape
-    start = [float(v) for v in origin[:2]]
-    events = [(0.0, 0)]
-    for axis, size in ((0, width), (1, height)):
-        if direction[axis] != 0:
-            times = ((np.arange(size + 1) - start[axis]) / direction[axis]).tolist()
-            events += [(t, int(direction[axis] < 0)) for t in times]
-    events = [*sorted({event for event in events if event >= (0.0, 0)}), (math.inf, 0)]
-    for now, after in itertools.pairwise(events):
-        cell = [_cell(start[axis], direction[axis], now) for axis in (0, 1)]
-        if 0 <= cell[0] < width and 0 <= cell[1] < height:
-            time = _reach(depth[cell[1], cell[0]], origin[2], direction[2], now, after)
-            if time is not None:
-                return time, tuple(cell)
-    return None
-
-
-def _cell(start, slope, now):
-    """The row or column at a moment, by counting borders rather than by rounding a product."""
-    if slope == 0:
-        return math.floor(start)
-    # The border k has been crossed if its moment is not later than now.
-    guess = math.floor(start + now[0] * slope)
-    candidates = range(guess - 2, guess + 3)
-    if slope > 0:
-        return max(k for k in candidates if ((k - start) / slope, 0) <= now)
-    return min(k - 1 for k in (*candidates, guess + 3) if ((k - start) / slope, 1) <= now)
-
-
-def _reach(depth, z, dz, now, after):
-    """The first time in [now, after) at which the ray is as deep as a texel."""
-    if not depth < math.inf:
-        return None
-    if dz > 0:
-        time = max(now, ((depth - z) / dz, 0))
-        return time[0] if time < after else None
-    if dz == 0:
-        return now[0] if z >= depth else None
-    until = ((depth - z) / dz, 1)
-    return now[0] if now < until else None
-
-
-def field(size, rng):
-    """Random depths with holes of every kind."""
-    depth = rng.uniform(0.2, 1, size)
-    kind = rng.random(size)
-    depth[kind < 0.15] = np.inf
-    depth[kind < 0.10] = 0
-    depth[kind < 0.05] = np.nan
-    return depth
-
-
-def awkward_rays(size, rng, count=150):
-    """Half of them anywhere; half on borders and corners, along axes and diagonals."""
-    side = max(size)
-    origin = rng.uniform((-2, -2, -0.5), (side + 2, side + 2, 1.2), (2 * count, 3))
-    direction = rng.normal(size=(2 * count, 3)) * (side / 2, side / 2, 1)
-    origin[count:, :2] = np.round(origin[count:, :2] * 2) / 2
-    origin[count:, 2] = np.round(origin[count:, 2] * 4) / 4
-    direction[count:] = rng.choice([0, 1, -1, 2, -2, 0.5, -0.5], (count, 3))
-    return origin, direction
 
 
 def check_exact(hit, depth, origin, direction, tolerance):
@@ -99,19 +29,6 @@ def check_exact(hit, depth, origin, direction, tolerance):
             np.testing.assert_allclose(hit.position[k], place, rtol=0, atol=tolerance)
             found += 1
     return found
-
-
-@pytest.mark.parametrize("size", SIZES, ids="{0[0]}x{0[1]}".format)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_pyramid_finds_what_a_walk_over_every_texel_finds(size, dtype):
-    rng = np.random.default_rng(size)
-    depth = field(size, rng).astype(dtype)
-    origin, direction = (x.astype(dtype) for x in awkward_rays(size, rng))
-    hit = run(depth, origin, direction)
-    assert hit.position.dtype == dtype
-    assert not hit.exhausted.any()
-    found = check_exact(hit, depth, origin, direction, 1e-4)
-    assert found > 30 or size == (1, 1)
 
 
 def test_many_rays_go_on_in_halves():
@@ -141,23 +58,6 @@ def test_under_vmap_every_ray_finds_the_same_in_as_many_steps():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("hole", [0.0, np.nan, np.inf, -1.0])
-def test_a_field_of_holes_is_never_hit(method, hole):
-    rng = np.random.default_rng(0)
-    origin, direction = awkward_rays((5, 6), rng, 20)
-    hit = run(np.full((5, 6), hole), origin, direction, method=method)
-    assert not hit.mask.any()
-    np.testing.assert_array_equal(hit.position, origin)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_rays_that_are_not_numbers_miss(method):
-    origin = np.array([[np.nan, 1, 0], [1, 1, 0], [np.inf, 0, 0], [1, 1, np.nan]])
-    direction = np.array([[0, 0, 1], [np.nan, 0, 1], [0, 1, 0], [1, 1, 1.0]])
-    assert not run(np.ones((3, 3)), origin, direction, method=method).mask.any()
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_a_vertical_ray_meets_its_texel(method):
     depth = np.random.default_rng(0).uniform(0.2, 1, (5, 7))
     y, x = np.mgrid[:5, :7] + 0.5
@@ -182,57 +82,6 @@ def test_a_bound_on_steps_is_kept_and_said():
     np.testing.assert_array_equal(hit.steps, np.minimum(free.steps, bound))
     within = ~np.asarray(hit.exhausted)
     np.testing.assert_array_equal(hit.mask[within], free.mask[within])
-
-
-# Where the methods fail: the fields of the chart.
-
-
-@pytest.mark.parametrize("make", [smooth, posts, cliff])
-@pytest.mark.parametrize("slope", [0, 4, 16])
-def test_the_fields_of_the_chart_are_met_exactly(make, slope):
-    depth = make(48)
-    origin, direction = slanted_rays(48, slope)
-    hit = run(depth, origin, direction)
-    check_exact(jax.tree.map(lambda x: x[::7], hit), depth, origin[::7], direction[::7], 1e-9)
-
-
-# From view to grazing: at least so often the method errs on posts, and on a cliff.
-FAILURES = [
-    ("descent", None, posts, 4, 0.02),
-    ("descent", None, posts, 16, 0.1),
-    ("descent", None, cliff, 16, 0.05),
-    ("linear", 8, posts, 4, 0.02),
-    ("linear", 8, posts, 16, 0.1),
-    ("linear", 8, cliff, 16, 0.05),
-    ("relief", 8, posts, 16, 0.1),
-]
-
-
-@pytest.mark.parametrize(("method", "steps", "make", "slope", "least"), FAILURES)
-def test_where_a_quick_method_fails(method, steps, make, slope, least):
-    assert error_rate(make(48), slope, method, steps) > least
-
-
-@pytest.mark.parametrize("method", ["linear", "relief"])
-def test_more_steps_err_less(method):
-    rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 64)]
-    assert rates[0] > 2 * rates[1]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_no_method_errs_from_the_front(method):
-    assert error_rate(posts(48), 0, method) == 0
-
-
-def test_steps_hardly_grow_with_the_size():
-    mean = {}
-    for size in (32, 128):
-        # The same picture in finer texels: the slant, in texels, grows with it.
-        origin, direction = slanted_rays(size, 6 * size / 32)
-        hit = run(smooth(size), origin, direction)
-        inside = ((origin[:, :2] >= 0) & (origin[:, :2] < size)).all(axis=1)
-        mean[size] = float(hit.steps[inside].mean())
-    assert mean[128] < 1.6 * mean[32]
 
 
 # The bilinear surface, and derivatives.

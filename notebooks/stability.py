@@ -1,0 +1,109 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Where every method fails
+#
+# One row is a case in which methods of an effect fail, in the literature or here. Each small
+# picture is what one method makes of it, in the order in which the sections below list them;
+# red marks what is wrong, missing or not a number. *Pass* counts the methods whose figures are
+# all within what the case asks. The last column is about derivatives, as they are in that case:
+#
+# - **zero**: the true derivative of what is computed is 0, and nothing can be fitted through
+#   it;
+# - **biased**: there is a derivative, but not that of what the picture should be;
+# - **missing**: the true one has a part, of what jumps or comes into sight, that ours lacks;
+# - **none**: integers, files, and peers that are not differentiated.
+
+# %%
+import sys
+
+import jax
+from IPython.display import HTML
+
+
+sys.path.append("../tests/benchmarks")
+import stability_atlas as stability
+
+
+jax.config.update("jax_enable_x64", True)
+HTML(stability.overview())
+
+# %% [markdown]
+# Every figure is an error, 0 at best. It is published in `tests/stability`, and `pytest -m
+# stability`, which is a part of every run of the tests, fails if one gets worse: where a method
+# passes, worse than what is asked; where it does not, by more than a fiftieth. `python
+# tests/benchmarks/stability_atlas.py` measures everything anew. What a case asks stands above
+# its figures; what it asks nothing of is *watched*.
+#
+# ## Depth of field
+#
+# Pictures of 46 x 46 pixels, circles of at most 12. *Bias* is the error of the derivative in
+# the logarithm of the aperture against the closed form's, over the same band as the picture's
+# error; *gradient* is how far derivatives in aperture, focus and depth lie outside the method's
+# own two one-sided difference quotients.
+
+# %%
+HTML(stability.section("dof"))
+
+# %% [markdown]
+# ## Gaussian blur
+
+# %%
+HTML(stability.section("blur"))
+
+# %% [markdown]
+# Of this effect, the figures now and as they are published:
+
+# %%
+for case, method in stability.rows("blur"):
+    found = case.find(method).figures
+    known = stability.published("blur")[case.name][method]
+    pairs = ", ".join(f"{name} {found[name]:.3g} ({known[name]:.3g})" for name in known)
+    print(f"{case.name:14} {method:16} {pairs}")
+
+# %% [markdown]
+# ## Reprojection
+
+# %%
+HTML(stability.section("reproject"))
+
+# %% [markdown]
+# ## Shadow maps
+
+# %%
+HTML(stability.section("shadow"))
+
+# %% [markdown]
+# ## Relighting
+
+# %%
+HTML(stability.section("relight"))
+
+# %% [markdown]
+# ## What the table cannot tell
+#
+# - **Which method to take.** A figure is that of one small scene, chosen so that something goes
+#   wrong in it. How often it does in your pictures, and what a method costs, is what the charts
+#   of each effect are for.
+# - **Whether a pass is a proof.** It says that one picture was within a bound. What holds for
+#   all pictures is tested elsewhere, on random ones: that a kernel's sums are those of a plain
+#   loop, that a bad pixel stays local, that a derivative is the difference quotient.
+# - **What a bound is worth.** Those that equations give (energy, centroid, a mask that misses
+#   nothing) are what they should be. Those of pictures (an error of 0.02 in a band, a share of
+#   holes) were chosen, and another choice moves a method from one side to the other.
+# - **How a failure looks in motion.** *Jump* and *unevenness* are all that there is of time.
+# - **Derivatives elsewhere.** They are compared along a few directions, at one point of each
+#   case. *Exact* means that no difference was found there; each function's docstring says what
+#   holds in general. A derivative that is exact for the method and *biased* against the truth
+#   still leads a fit to the wrong place, as in *blurred foreground*.
+# - **Time.** No row holds a wall-clock time, for a busy machine would fail it.

@@ -1,0 +1,194 @@
+"""The stability atlas: every case in which methods fail, as one table with pictures.
+
+`python tests/benchmarks/stability_atlas.py` measures every case, or those of the effects that
+it is given, and publishes what it finds in `tests/stability`: the figures as JSON, against
+which a regression fails, and a sheet of thumbnails in the same order. `--html FILE` writes a
+report of both, as `notebooks/stability.ipynb` shows it; `--no-measure` that of what is
+published.
+"""
+
+import argparse
+import base64
+import functools as ft
+import html
+import importlib
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from failures import CASES, Case
+from PIL import Image
+from tqdm.auto import tqdm
+
+
+EFFECTS = ("dof", "blur", "reproject", "shadow", "relight")
+PUBLISHED = Path(__file__).parents[1] / "stability"
+TILE, ACROSS = 48, 16
+
+
+@ft.cache
+def registry() -> tuple[Case, ...]:
+    """Every case of every effect, in the order of `EFFECTS`."""
+    for effect in EFFECTS:
+        importlib.import_module(f"{effect}_failures")
+    return tuple(sorted(CASES, key=lambda case: EFFECTS.index(case.effect)))
+
+
+def rows(effect: str) -> list[tuple[Case, str]]:
+    """Every case of an effect with every method."""
+    cases = [case for case in registry() if case.effect == effect]
+    return [(case, method) for case in cases for method in case.gradients]
+
+
+@ft.cache
+def published(effect: str) -> dict[str, Any]:
+    """The figures of an effect by case, method and name."""
+    return json.loads((PUBLISHED / f"{effect}.json").read_text(encoding="utf-8"))
+
+
+def thumbnail(picture: Any) -> np.ndarray:
+    """Linear values from 0 to 1 as a tile of bytes, in sRGB: the nearest pixel of the longer
+    side's square; grey where there is no picture, red where a value is not a number."""
+    if picture is None:
+        return np.full((TILE, TILE, 3), 235, np.uint8)
+    picture = np.asarray(picture, float)
+    picture = np.atleast_3d(picture) * np.ones(3)
+    side = max(picture.shape[:2])
+    y, x = (np.floor((np.arange(TILE) + 0.5) * side / TILE).astype(int) for _ in "yx")
+    tile = np.full((side, side, 3), 1.0)
+    tile[: picture.shape[0], : picture.shape[1]] = picture
+    tile = tile[np.ix_(y, x)]
+    bad = np.isnan(tile).any(axis=-1)
+    tile = np.clip(np.nan_to_num(tile), 0, 1)
+    curve = np.where(tile <= 0.0031308, 12.92 * tile, 1.055 * tile ** (1 / 2.4) - 0.055)
+    curve[bad] = (0.8, 0.1, 0.1)
+    return np.round(255 * curve).astype(np.uint8)
+
+
+@ft.cache
+def tiles(effect: str) -> dict[tuple[str, str], np.ndarray]:
+    """The published thumbnails of an effect by case and method."""
+    sheet = np.asarray(Image.open(PUBLISHED / f"{effect}.png").convert("RGB"))
+    found = {}
+    for k, (case, method) in enumerate(rows(effect)):
+        y, x = k // ACROSS * TILE, k % ACROSS * TILE
+        found[case.name, method] = sheet[y : y + TILE, x : x + TILE]
+    return found
+
+
+def measure(effect: str) -> None:
+    """Publish the figures and the thumbnails of an effect."""
+    figures: dict[str, Any] = {case.name: {} for case in registry() if case.effect == effect}
+    sheet = []
+    for case, method in tqdm(rows(effect), desc=effect, mininterval=5):
+        found = case.find(method)
+        rounded = {name: float(f"{value:.3g}") for name, value in found.figures.items()}
+        figures[case.name][method] = rounded
+        sheet.append(thumbnail(found.picture))
+    sheet += [thumbnail(None)] * (-len(sheet) % ACROSS)
+    lines = np.concatenate(sheet).reshape(-1, ACROSS, TILE, TILE, 3).swapaxes(1, 2)
+    picture = Image.fromarray(lines.reshape(-1, ACROSS * TILE, 3)).quantize(255)
+    PUBLISHED.mkdir(exist_ok=True)
+    picture.save(PUBLISHED / f"{effect}.png", optimize=True)
+    text = json.dumps(figures, indent=1, allow_nan=False)
+    (PUBLISHED / f"{effect}.json").write_text(text + "\n", encoding="utf-8")
+
+
+# The report.
+
+
+def _img(picture: np.ndarray) -> str:
+    """A picture in the page itself."""
+    file = io.BytesIO()
+    Image.fromarray(picture).quantize(64).save(file, "png", optimize=True)
+    text = base64.b64encode(file.getvalue()).decode()
+    return f'<img src="data:image/png;base64,{text}" width="{picture.shape[1]}">'
+
+
+def _row(cells: list[str], tag: str = "td") -> str:
+    return "<tr>" + "".join(f'<{tag} align="left">{cell}</{tag}>' for cell in cells) + "</tr>"
+
+
+def _cell(figure: float | None, bound: float | None) -> str:
+    if figure is None:
+        return ""
+    mark = "" if bound is None else " &#10003;" if figure <= bound else " <b>&#10007;</b>"
+    return f"{figure:.2g}{mark}"
+
+
+def table(case: Case) -> str:
+    """A case as a table: a row for each method, with its picture, figures and gradient."""
+    title = f"<h4>{case.name}</h4><p>{html.escape(case.says)}</p>"
+    if not case.gradients:
+        return title
+    bounds = [
+        f"{name}<br>{'watched' if bound is None else f'at most {bound:.3g}'}"
+        for name, bound in case.asks.items()
+    ]
+    figures, lines = published(case.effect)[case.name], []
+    for method, gradient in case.gradients.items():
+        cells = [_cell(figures[method].get(name), bound) for name, bound in case.asks.items()]
+        tile = _img(tiles(case.effect)[case.name, method])
+        lines.append(_row([html.escape(method), tile, *cells, html.escape(gradient)]))
+    head = _row(["method", "", *bounds, "gradient"], "th")
+    return f"{title}<table><thead>{head}</thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def overview() -> str:
+    """One row for each case: all its pictures, who fails, whose gradient is not exact."""
+    lines = []
+    for case in registry():
+        found = published(case.effect)[case.name]
+        fails = [method for method in found if not case.passes(found[method])]
+        kinds: dict[str, list[str]] = {}
+        for method, gradient in case.gradients.items():
+            kinds.setdefault(re.match(r"\w+", gradient)[0], []).append(method)
+        kinds.pop("exact", None)
+        small = [tiles(case.effect)[case.name, method][::2, ::2] for method in found]
+        cells = [
+            case.effect,
+            case.name,
+            _img(np.concatenate(small, axis=1)) if small else "",
+            f"{len(found) - len(fails)} of {len(found)}" if found else "not measured",
+            ", ".join(fails),
+            "; ".join(f"<b>{kind}</b>: {', '.join(who)}" for kind, who in kinds.items()),
+        ]
+        lines.append(_row(cells))
+    head = _row(["effect", "case", "", "pass", "fail", "gradient other than exact"], "th")
+    return f"<table><thead>{head}</thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def report() -> str:
+    """Everything on one page."""
+    parts = [f"<h3>{effect}</h3>{section(effect)}" for effect in EFFECTS]
+    style = "<style>td, th { padding: 2px 8px; vertical-align: top; }</style>"
+    return f"<!doctype html><meta charset=utf-8>{style}{overview()}{''.join(parts)}"
+
+
+def section(effect: str) -> str:
+    """All cases of one effect."""
+    return "".join(table(case) for case in registry() if case.effect == effect)
+
+
+def main() -> None:
+    """Measure, publish, report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "effects", nargs="*", choices=[*EFFECTS, []], help="all, if none is named"
+    )
+    parser.add_argument("--html", type=Path, help="where to write the report")
+    parser.add_argument("--no-measure", action="store_true", help="report what is published")
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    for effect in () if given.no_measure else given.effects or EFFECTS:
+        measure(effect)
+    if given.html:
+        given.html.write_text(report(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
