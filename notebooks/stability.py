@@ -18,8 +18,7 @@
 # red marks what is wrong, missing or not a number. *Pass* counts the methods whose figures are
 # all within what the case asks. The last column is about derivatives, as they are in that case:
 #
-# - **zero**: the true derivative of what is computed is 0, and nothing can be fitted through
-#   it;
+# - **zero**: that of what is computed is 0, and nothing can be fitted through it;
 # - **biased**: there is a derivative, but not that of what the picture should be;
 # - **missing**: the true one has a part, of what jumps or comes into sight, that ours lacks;
 # - **none**: integers, files, and peers that are not differentiated.

@@ -28,6 +28,7 @@ from tqdm.auto import tqdm
 EFFECTS = ("dof", "blur", "reproject", "shadow", "relight")
 PUBLISHED = Path(__file__).parents[1] / "stability"
 TILE, ACROSS = 48, 16
+KINDS = re.compile(r"\b(zero|biased|missing|none)\b")
 
 
 @ft.cache
@@ -109,6 +110,15 @@ def _img(picture: np.ndarray) -> str:
     return f'<img src="data:image/png;base64,{text}" width="{picture.shape[1]}">'
 
 
+def _framed(tile: np.ndarray) -> np.ndarray:
+    """With a grey line on its right and below."""
+    return np.pad(tile, ((0, 1), (0, 1), (0, 0)), constant_values=160)
+
+
+def _who(some: list[str], of: dict[str, Any]) -> str:
+    return "all" if some and len(some) == len(of) else html.escape("; ".join(some))
+
+
 def _row(cells: list[str], tag: str = "td") -> str:
     return "<tr>" + "".join(f'<{tag} align="left">{cell}</{tag}>' for cell in cells) + "</tr>"
 
@@ -132,9 +142,9 @@ def table(case: Case) -> str:
     figures, lines = published(case.effect)[case.name], []
     for method, gradient in case.gradients.items():
         cells = [_cell(figures[method].get(name), bound) for name, bound in case.asks.items()]
-        tile = _img(tiles(case.effect)[case.name, method])
+        tile = _img(_framed(tiles(case.effect)[case.name, method]))
         lines.append(_row([html.escape(method), tile, *cells, html.escape(gradient)]))
-    head = _row(["method", "", *bounds, "gradient"], "th")
+    head = _row(["method", "", *bounds, "derivatives"], "th")
     return f"{title}<table><thead>{head}</thead><tbody>{''.join(lines)}</tbody></table>"
 
 
@@ -146,19 +156,19 @@ def overview() -> str:
         fails = [method for method in found if not case.passes(found[method])]
         kinds: dict[str, list[str]] = {}
         for method, gradient in case.gradients.items():
-            kinds.setdefault(re.match(r"\w+", gradient)[0], []).append(method)
-        kinds.pop("exact", None)
-        small = [tiles(case.effect)[case.name, method][::2, ::2] for method in found]
+            for kind in dict.fromkeys(KINDS.findall(gradient)):
+                kinds.setdefault(kind, []).append(method)
+        small = [_framed(tiles(case.effect)[case.name, method][::2, ::2]) for method in found]
         cells = [
             case.effect,
             case.name,
             _img(np.concatenate(small, axis=1)) if small else "",
             f"{len(found) - len(fails)} of {len(found)}" if found else "not measured",
-            ", ".join(fails),
-            "; ".join(f"<b>{kind}</b>: {', '.join(who)}" for kind, who in kinds.items()),
+            _who(fails, found),
+            "<br>".join(f"<b>{kind}</b>: {_who(who, found)}" for kind, who in kinds.items()),
         ]
         lines.append(_row(cells))
-    head = _row(["effect", "case", "", "pass", "fail", "gradient other than exact"], "th")
+    head = _row(["effect", "case", "", "pass", "fail", "derivatives other than exact"], "th")
     return f"<table><thead>{head}</thead><tbody>{''.join(lines)}</tbody></table>"
 
 
