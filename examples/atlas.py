@@ -1,11 +1,11 @@
 """Every method of every effect, measured and charted.
 
-Measures the methods of depth of field, blur, reprojection, ray search, shadows and relighting,
-and the plans of `budget`, at several settings on two scenes each, the second made to fail.
-Writes `atlas.csv`, a row for each measurement, `atlas.txt`, the machine, and for each effect
-the charts of time and of memory against error, on each scene, and of time and error against the
-size of the picture and against the effect's own size, as PNG and SVG. Nothing else should run
-meanwhile.
+Measures the methods of depth of field, blur, reprojection, ray search, shadows, relighting and
+a bounce of light, and the plans of `budget`, at several settings on two scenes each, the second
+made to fail. Writes `atlas.csv`, a row for each measurement, `atlas.txt`, the machine, and for
+each effect the charts of time and of memory against error, on each scene, and of time and error
+against the size of the picture and against the effect's own size, as PNG and SVG. Nothing else
+should run meanwhile.
 """
 
 import argparse
@@ -117,6 +117,16 @@ EFFECTS = {
         (1, 4, 16, 64),
         "{} lights",
         "every light shaded, unshadowed",
+    ),
+    "bounce": Effect(
+        "a bounce of light",
+        atlas_cases.bounced,
+        (STILL, FENCE),
+        "rank of the transfer",
+        64,
+        (4, 16, 64, 128),
+        "by way of 256 points",
+        "all 256 singular vectors",
     ),
 }
 

@@ -408,3 +408,29 @@ def relit(at: Point) -> Case:
         "plan": plans(budget.relight, lambda data: data["of"]),
     }
     return Case((data,), relight.render(*data["of"]), methods)
+
+
+@functools.cache
+def transfer(name: str, side: int):
+    """How light goes by way of 256 points, with every singular vector."""
+    camera, _, gbuffer, _ = view(name, side)
+    return scene.transfer(mesh_of(name), gbuffer, camera, points=256, rank=256)
+
+
+def bounced(at: Point) -> Case:
+    camera, _, gbuffer, _ = view(at.scene, at.side)
+    whole, lights = transfer(at.scene, at.side), scene.default_lights(camera)
+    cut = lambda rank: eqx.tree_at(
+        lambda t: (t.receive, t.send), whole, (whole.receive[..., :rank], whole.send[:rank])
+    )
+    ranks = tuple(dict.fromkeys((at.own, 4, 16, 128)))
+    methods = {
+        "indirect": {
+            f"rank {rank}": lambda transfers, gbuffer, lights, rank=rank: relight.indirect(
+                gbuffer, transfers[rank], lights
+            )
+            for rank in ranks
+        }
+    }
+    truth = relight.indirect(gbuffer, whole, lights)
+    return Case(({rank: cut(rank) for rank in ranks}, gbuffer, lights), truth, methods)

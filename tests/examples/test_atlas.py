@@ -144,7 +144,7 @@ def test_an_earlier_run_is_drawn_again(atlas, out, tmp_path, monkeypatch, capsys
 PARTS = {
     *("Accumulation", "binomial_weights", "linear_taps", "Candidates", "Receivers"),
     *("candidates", "receivers", "light_cameras", "Choice", "Hit", "choose"),
-    *("RelightState", "best_caches", "capture_normals", "indirect", "shade"),
+    *("RelightState", "best_caches", "capture_normals", "shade"),
 }
 
 
