@@ -88,9 +88,9 @@ def relight(
     gbuffer: GBuffer,
     camera: PinholeCamera | OrthographicCamera,
     lights: Sequence[Light],
-    visibilities: Sequence[Float[ArrayLike, "height width"] | None] | None = None,
     *,
     max_error: int | float,
+    visibilities: Sequence[Float[ArrayLike, "height width"] | None] | None = None,
 ) -> Plan:
     """The fewest lights within an error of `relight.render` under all of them.
 
@@ -110,9 +110,9 @@ def relight(
 
     - `gbuffer`, `camera`: as in `relight.render`, height width.
     - `lights`: a sequence of lights of any kinds.
+    - `max_error`: root mean square, linear image units, over all pixels and channels.
     - `visibilities`: as in `relight.start`: for each light height width in [0, 1], or None if
       it has no shadows. None alone stands for no shadows at all.
-    - `max_error`: root mean square, linear image units, over all pixels and channels.
 
     **Returns:** a `Plan`, to be called with `gbuffer, camera, lights` and, where there are
     shadows, `visibilities`: as many as there are here, None for those that are left out.

@@ -96,7 +96,7 @@ def test_shadows_that_take_nothing_away_need_no_map():
     cache, camera, lights = scene(rng)
     visibilities = [np.ones(SIZE), rng.uniform(0, 1, SIZE), np.ones(SIZE), None, None]
     full = relight.start(cache, camera, lights, visibilities=visibilities).image
-    plan = budget.relight(cache, camera, lights, visibilities, max_error=1e-4)
+    plan = budget.relight(cache, camera, lights, visibilities=visibilities, max_error=1e-4)
     assert "shadows 0, 2, 0 at most" in str(plan)
     without = plan(cache, camera, lights, [None, visibilities[1], None, None, None])
     assert np.sqrt(np.mean((without - full) ** 2)) <= 1e-4

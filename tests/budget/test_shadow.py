@@ -3,10 +3,12 @@
 import functools
 import inspect
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfx import budget, shadow
+from jaxfx.budget.shadow import Picked
 
 
 def scene(rng):
@@ -41,10 +43,24 @@ def test_plans_differ_with_scenes_and_say_why(plans):
     texts = [str(plan) for plan, _, _ in plans]
     for part in (
         "it can't matter in more than",
+        "% of the pixels, held fixed",
         "outside of the",
         "a filter larger than 3 x 3",
     ):
         assert any(part in text for text in texts), part
+
+
+def test_picked_pixels_are_filtered_and_no_others():
+    (shadow_map, _), how = scene(np.random.default_rng(4)), {"bias": 0.1}
+    shadow_map[:, :12] = 2.0
+    y, x = np.mgrid[4:20, 4:20] + 0.5
+    data = shadow_map, shadow.Receivers(x, y, 5 + 0 * x, 0 * x)
+    pixels = np.random.default_rng(5).permutation(256)[:100]
+    full, hard = shadow.pcf(*data, size=5, **how), shadow.hard(*data, **how)
+    some = np.isin(np.arange(256), pixels).reshape(16, 16)
+    assert (np.asarray(full) != hard)[some].any() and (np.asarray(full) != hard)[~some].any()
+    plan = Picked(jnp.asarray(0.1), jnp.asarray(0.0), 5, jnp.append(pixels, 256))
+    np.testing.assert_array_equal(plan(*data), np.where(some, full, hard))
 
 
 def test_a_negative_error_is_refused():
