@@ -15,12 +15,16 @@ _STEPS, _HALVINGS = 64, 8
 
 
 def descend(
-    depth: Float[Array, "height width"], r: Rays, begin: Entry, max_steps: int | None
+    depth: Float[Array, "height width"],
+    origin: Float[Array, "ray 3"],
+    direction: Float[Array, "ray 3"],
+    max_steps: int | None,
 ) -> Found:
     """From the pyramid's root to a leaf, on to a node's depth where the ray is nearer.
 
     No border is looked at: a node that the ray has left on its way may have held the hit.
     """
+    r, begin = _entering(depth, origin, direction)
     pyramid = minimum_pyramid(depth)
     time, _ = _interval(depth, r, begin)
     levels = len(pyramid.shapes) if max_steps is None else min(len(pyramid.shapes), max_steps)
@@ -41,9 +45,13 @@ def descend(
 
 
 def linear(
-    depth: Float[Array, "height width"], r: Rays, begin: Entry, max_steps: int | None
+    depth: Float[Array, "height width"],
+    origin: Float[Array, "ray 3"],
+    direction: Float[Array, "ray 3"],
+    max_steps: int | None,
 ) -> Found:
     """Equal steps until the ray is behind the depth, then one secant."""
+    r, begin = _entering(depth, origin, direction)
     before, after, found, steps = _first_behind(depth, r, begin, max_steps)
     gap_before, gap_after = (_gap(depth, r, time) for time in (before, after))
     known = found & jnp.isfinite(gap_before) & (gap_before < 0)
@@ -54,9 +62,13 @@ def linear(
 
 
 def relief(
-    depth: Float[Array, "height width"], r: Rays, begin: Entry, max_steps: int | None
+    depth: Float[Array, "height width"],
+    origin: Float[Array, "ray 3"],
+    direction: Float[Array, "ray 3"],
+    max_steps: int | None,
 ) -> Found:
     """Equal steps until the ray is behind the depth, then bisection of the last."""
+    r, begin = _entering(depth, origin, direction)
     before, after, found, steps = _first_behind(depth, r, begin, max_steps)
 
     def halve(_, ends):
@@ -68,6 +80,11 @@ def relief(
     _, time = jax.lax.fori_loop(0, _HALVINGS, halve, (before, after))
     steps = steps + jnp.where(found, _HALVINGS, 0)
     return _found(depth, time, *_place(r, time), found, steps)
+
+
+def _entering(depth: Array, origin: Array, direction: Array) -> tuple[Rays, Entry]:
+    r = _grid.rays(origin, direction)
+    return r, _grid.entry(r, *depth.shape)
 
 
 def _first_behind(depth: Array, r: Rays, begin: Entry, max_steps: int | None):

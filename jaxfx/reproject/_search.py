@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfx.reproject import _grid, _march, _walk
+from jaxfx.reproject import _march, _walk
 from jaxfx.reproject._found import Found
 
 
@@ -40,8 +40,7 @@ _FOUND = jax.tree.structure(Found(*Found._fields))  # pyright: ignore[reportArgu
 def _searcher(method: str, max_steps: int | None):
     @jax.custom_batching.custom_vmap
     def one(depth, origin, direction):
-        r = _grid.rays(origin, direction)
-        return METHODS[method](depth, r, _grid.entry(r, *depth.shape), max_steps)
+        return METHODS[method](depth, origin, direction, max_steps)
 
     @one.def_vmap
     def many(size, batched, depth, origin, direction):

@@ -50,8 +50,8 @@ def intersect(
     without end. The hit is the first t >= 0 at which origin + t direction lies inside the
     image and z(t) >= depth[floor y, floor x]: on a column's top, or through its side.
 
-    "pyramid" goes from cell to cell of a minimum pyramid, up a level beyond a parent's border
-    and down where a cell's depth is reached. It is exact: what a walk over every texel would
+    "pyramid" goes from cell to cell of a minimum pyramid, down where a cell's depth is reached
+    and up a level where the ray has come far. It is exact: what a walk over every texel would
     find. The others err. "descent" goes from the root to a leaf and looks at no border: it
     passes what stands beside its way. "linear" takes equal steps, then one secant; "relief"
     takes equal steps, then halves the last: both step over what is thinner than a step.

@@ -16,7 +16,7 @@ def _held(place, node, level):
 def _walk(values, offsets, columns, size, thickness, origins, directions, times, steps):
     """Each ray alone, in scalar code, as one would write it in C. Rays start inside.
 
-    After the root they begin where ours do: the steps are the same, and what is compared is how
+    They begin and change levels as ours do: the steps are the same, and what is compared is how
     long they take.
     """
     never = np.float32(np.inf)
@@ -49,7 +49,7 @@ def _walk(values, offsets, columns, size, thickness, origins, directions, times,
                     time = reach
                     x = _held(ox + time * dx, node_x, level)
                     y = _held(oy + time * dy, node_y, level)
-                level -= 1
+                level = max(level - 2, 0)
                 if count == 1 and dz > 0:
                     way = thickness / dz * max(abs(dx), abs(dy))
                     level = min(level, math.ceil(math.log2(max(way / 4, 1))))
@@ -67,8 +67,8 @@ def _walk(values, offsets, columns, size, thickness, origins, directions, times,
                 if leave_y <= leave_x
                 else _held(oy + time * dy, node_y, level)
             )
-            if (x >> (level + 1)) != (last_x >> (level + 1)) or (
-                (y >> (level + 1)) != (last_y >> (level + 1))
+            if (x >> (level + 2)) != (last_x >> (level + 2)) or (
+                (y >> (level + 2)) != (last_y >> (level + 2))
             ):
                 level += 1
             if level > top:

@@ -1,8 +1,10 @@
 """The search for crossings against native code, in one run: 512 x 512 rays, float32.
 
 `pytest --benchmark-only tests/benchmarks/test_reproject_speed.py` prints each group with the
-ratios to its quickest. The floor: some 9 to 23 steps a ray, each one read of the pyramid.
+ratios to its quickest. The floor: some 7 to 21 steps a ray, each one read of the pyramid.
 """
+
+import timeit
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 import reproject_cases as cases
 from reproject_cases import fan, hills
+from turns import in_turns
 
 from jaxfx import PinholeCamera, scene
 from jaxfx._pyramid import minimum_pyramid
@@ -52,11 +55,32 @@ def test_native(benchmark, method, slant):
         assert float(hit.steps.mean()) == pytest.approx(steps.mean(), rel=1e-3)
 
 
-@pytest.mark.parametrize("side", [256, 512, 1024, 2048])
-def test_size(benchmark, side):
-    """The time of a ray from 256 to 2048: divide by the rays."""
-    benchmark.group = "slanting rays, one for each texel"
-    run(benchmark, search(hills(side), *fan(side, SLANTS["slanting"])))
+@pytest.mark.parametrize("slant", SLANTS)
+def test_size(benchmark, slant):
+    """The time of a ray from 256 to 2048, native code beside ours: `extra_info` has the ratios.
+
+    The steps of a ray grow with the logarithm of the size.
+    """
+    benchmark.group = "nanoseconds a ray, one ray for each texel"
+    nanoseconds, steps = {}, {}
+    for side in (256, 512, 1024, 2048):
+        depth, rays = hills(side), fan(side, SLANTS[slant])
+        ours = search(depth, *rays)
+        pyramid = minimum_pyramid(jnp.asarray(depth))
+        steps[side] = float(ours().steps.mean())
+        for who, function in {
+            "ours": ours,
+            "native": lambda pyramid=pyramid, rays=rays: native_reproject.walk(pyramid, *rays),
+        }.items():
+            times = [timeit.timeit(function, number=1) for _ in range(1 + 2 * 2048 // side)]
+            nanoseconds[who, side] = 1e9 / side**2 * np.median(times[1:])
+    for who in ("ours", "native"):
+        growth = nanoseconds[who, 2048] / nanoseconds[who, 256]
+        benchmark.extra_info[f"{who}: growth"] = growth
+        row = ", ".join(f"{nanoseconds[who, side]:.0f}" for side in steps)
+        print(f"\n{slant}, {who}: {row} ns, x {growth:.2f}")
+    print(f"steps x {steps[2048] / steps[256]:.2f}")
+    run(benchmark, search(hills(2048), *fan(2048, SLANTS[slant])))
 
 
 @pytest.mark.parametrize("method", ["pyramid", "descent", "linear", "relief"])
@@ -66,12 +90,16 @@ def test_methods(benchmark, method):
 
 
 def test_a_batch(benchmark):
-    """Four searches under `vmap`, to compare with four times one of 256."""
-    benchmark.group = "slanting rays, one for each texel"
+    """Four searches under `vmap`, to compare with four times one."""
+    benchmark.group = "slanting rays, 256 x 256"
     depth, (origin, direction) = jnp.asarray(hills(256)), fan(256, SLANTS["slanting"])
     four = jnp.stack([jnp.asarray(origin)] * 4)
     many = jax.jit(jax.vmap(lambda o: intersect(depth, o, direction)))
-    run(benchmark, lambda: jax.block_until_ready(many(four)))
+    functions = {
+        "one": search(depth, origin, direction),
+        "four": lambda: jax.block_until_ready(many(four)),
+    }
+    in_turns(benchmark, functions)
 
 
 def still_life(side):

@@ -11,7 +11,7 @@ import pytest
 from reproject_cases import run, slanted_rays
 from reproject_failures import awkward_rays, field, grid_walk
 
-from jaxfx.reproject import intersect
+from jaxfx.reproject import _walk, intersect
 
 
 METHODS = ("pyramid", "descent", "linear", "relief")
@@ -31,13 +31,16 @@ def check_exact(hit, depth, origin, direction, tolerance):
     return found
 
 
-def test_many_rays_go_on_in_halves():
+@pytest.mark.parametrize(("count", "together"), [(9000, _walk._TOGETHER), (9001, 4000)])
+def test_many_rays_go_on_in_parts_and_thirds(count, together, monkeypatch):
+    # Of another number, or JAX would take the program that it has traced before.
+    monkeypatch.setattr(_walk, "_TOGETHER", together)
     rng = np.random.default_rng(5)
     depth = field((64, 64), rng)
-    origin = rng.uniform((0, 0, 0), (64, 64, 0.1), (9000, 3))
-    direction = rng.normal(size=(9000, 3)) * (64, 64, 1)
+    origin = rng.uniform((0, 0, 0), (64, 64, 0.1), (count, 3))
+    direction = rng.normal(size=(count, 3)) * (64, 64, 1)
     hit = run(depth, origin, direction)
-    pick = rng.choice(9000, 400, replace=False)
+    pick = np.append(rng.choice(count, 400, replace=False), count - 1)
     some = jax.tree.map(lambda x: x[pick], hit)
     assert check_exact(some, depth, origin[pick], direction[pick], 1e-9) > 100
 
