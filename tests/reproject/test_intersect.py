@@ -42,7 +42,7 @@ def test_many_rays_go_on_in_parts_and_thirds(count, together, monkeypatch):
     hit = run(depth, origin, direction)
     pick = np.append(rng.choice(count, 400, replace=False), count - 1)
     some = jax.tree.map(lambda x: x[pick], hit)
-    assert check_exact(some, depth, origin[pick], direction[pick], 1e-9) > 100
+    assert check_exact(some, depth, origin[pick], direction[pick], 1e-9) > 50
 
 
 def test_under_vmap_every_ray_finds_the_same_in_as_many_steps():
