@@ -2,6 +2,7 @@
 
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,6 +75,12 @@ def test_lights_are_computed_where_they_are_needed():
     ]
     picture = plan(cache, camera, lights, visibilities)
     np.testing.assert_allclose(picture, sum(alone), rtol=1e-9)
+    # The sum is linear in the lights' colours, and so is its own derivative along them.
+    scaled = lambda s: [
+        eqx.tree_at(lambda light: light.color, light, s * light.color) for light in lights
+    ]
+    total = lambda s: jnp.sum(plan(cache, camera, scaled(s), visibilities))
+    np.testing.assert_allclose(jax.grad(total)(1.0), picture.sum(), rtol=1e-9)
 
 
 def test_a_light_that_reaches_a_corner_is_computed_there_alone():
