@@ -24,7 +24,7 @@ from jaxfx.lens import FocusPlanes, ThinLens
 # From which size on to try sprites at lower resolutions, in pixels; not below 3 epsilon.
 _SPLITS = (8.0, 10.0)
 # Taps of gather, whose errors tell how many would do; more than so many are not tried.
-_FEW, _MORE, _MOST = 4, 16, 256
+_FEW, _MORE, _MOST = 4, 16, 64
 # The parts that are tried: so many to a side, of so many pixels each way and what reaches them,
 # if they are less than this share of the picture; or else all of it.
 _PARTS, _SIDE, _SHARE = 3, 64, 1 / 3

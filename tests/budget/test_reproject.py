@@ -2,14 +2,10 @@
 
 import inspect
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfx import PinholeCamera, budget, reproject
-from jaxfx.budget._tiles import blocks
-from jaxfx.budget.reproject import Blend
 
 
 SIZE = (10, 12)
@@ -48,17 +44,6 @@ def test_some_plans_leave_a_source_out_and_some_a_few_tiles_of_it(plans):
     texts = [str(plan) for plan, _, _ in plans]
     assert any("all of sources 1, where others show next to the same" in text for text in texts)
     assert any("% of the rays, where" in text for text in texts)
-
-
-def test_a_plan_has_the_derivative_of_what_it_draws():
-    """The picture is linear in the sources', and so is its own derivative along them."""
-    images, *data = scene(np.random.default_rng(0))
-    uses = np.random.default_rng(1).uniform(size=(2, SIZE[0] * SIZE[1])) < 0.7
-    parts = blocks(uses, list(zip(images, data[0], data[1], strict=True)))
-    total = lambda images: jnp.sum(Blend(parts, SIZE)(images, *data)[0])
-    value, slopes = jax.value_and_grad(total)([jnp.asarray(image) for image in images])
-    along = sum(float(jnp.sum(x * y)) for x, y in zip(images, slopes, strict=True))
-    np.testing.assert_allclose(along, value, rtol=1e-9)
 
 
 def test_a_plan_knows_what_the_effect_knows(plans):
