@@ -4,6 +4,7 @@
 ratios to its quickest. The floor: some 7 to 21 steps a ray, each one read of the pyramid.
 """
 
+import functools
 import timeit
 
 import jax
@@ -15,7 +16,7 @@ import reproject_cases as cases
 from reproject_cases import fan, hills
 from turns import in_turns
 
-from jaxfx import PinholeCamera, scene
+from jaxfx import PinholeCamera, ThinLens, dof, metrics, scene
 from jaxfx._pyramid import minimum_pyramid
 from jaxfx.reproject import intersect, warp
 
@@ -155,3 +156,26 @@ def test_peers(benchmark, peer):
     benchmark.extra_info |= {
         k: float(v) for k, v in cases.scores(*function(), truth, seen).items()
     }
+
+
+@pytest.mark.parametrize("method", ["scatter", "layered", "warp through 4 points", "16", "64"])
+def test_depth_of_field(benchmark, method):
+    """Looks through a lens by reprojecting one picture, beside what is made for it.
+
+    With each goes its PSNR to 256 pinhole pictures from all over the lens.
+    """
+    benchmark.group = "depth of field of the still life, 160 x 160"
+    mesh, side = scene.still_life(), 160
+    source, photograph = cases.photographer(mesh, side)
+    image, depth = photograph(source)
+    lens = ThinLens.from_camera(source, aperture=0.08, focus_distance=2.5)
+    points = {"warp through 4 points": 4, "16": 16, "64": 64}
+    look = jax.jit(lambda camera: warp(image, depth, source, camera)[0])
+    many = functools.partial(dof.accumulate, camera=source, lens=lens, progress=False)
+    function = {
+        "scatter": jax.jit(lambda: dof.scatter(image, depth, lens, max_coc=16)),
+        "layered": jax.jit(lambda: dof.layered(image, depth, lens, max_coc=16)),
+    }.get(method) or (lambda: many(look, samples=points[method]).image)
+    run(benchmark, lambda: jax.block_until_ready(function()))
+    truth = many(lambda camera: photograph(camera)[0], samples=256)
+    benchmark.extra_info["PSNR"] = float(metrics.psnr(function(), truth.image))
