@@ -18,16 +18,15 @@ import math
 import os
 import platform
 import re
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, get_args
+from typing import Any, NamedTuple, get_args
 
 import atlas_cases
 import jax
 import matplotlib
+from _begin import fail, make_folder
 from atlas_cases import FENCE, HILLS, POSTS, SPIKES, STILL, Case, OnHost, Planned, Point
 from tqdm.auto import tqdm
 
@@ -378,20 +377,6 @@ def parse() -> argparse.Namespace:
     if arguments.size < 32 or arguments.size % 4:
         parser.error(f"--size must be a multiple of 4 from 32, got {arguments.size}")
     return arguments
-
-
-def fail(message: object) -> NoReturn:
-    sys.exit(f"atlas.py: error: {message}")
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than after the work."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        fail(f"--out must be a folder to write to: {error}")
-    return folder
 
 
 def earlier(path: Path) -> tuple[list[Row], str]:

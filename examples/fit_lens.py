@@ -12,8 +12,6 @@ import json
 import logging
 import math
 import os
-import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -21,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from _begin import fail, make_folder
 
 from jaxfx import ThinLens, dof, exr, fit, metrics, relight, reproject, scene, tradeoff
 from jaxfx.exr.layers import write_whole
@@ -62,25 +61,15 @@ def load(path: Path | None, size: int):
         camera = scene.default_camera(mesh, height=size, width=size)
         depth = scene.gbuffer(mesh, camera, height=size, width=size).depth
     except (OSError, ValueError, RuntimeError) as error:
-        sys.exit(f"fit_lens.py: error: {error}")
+        fail(error)
     return mesh, camera, scene.default_lights(camera), depth
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than after minutes of work."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        sys.exit(f"fit_lens.py: error: --out must be a folder to write to: {error}")
-    return folder
 
 
 def lens_for(camera, depth) -> ThinLens:
     """A lens focused on the nearer third of what is seen, open as wide as LARGEST_COC says."""
     seen = depth[jnp.isfinite(depth)]
     if jnp.max(seen) < 1.001 * jnp.min(seen):
-        sys.exit("fit_lens.py: error: all that is seen lies at one depth, nothing is blurred")
+        fail("all that is seen lies at one depth, nothing is blurred")
     focus = jnp.quantile(seen, 1 / 3)
     unit = ThinLens.from_camera(camera, aperture=1.0, focus_distance=focus)
     largest = jnp.max(unit.circle_of_confusion(seen))

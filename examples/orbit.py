@@ -7,13 +7,12 @@ sheet with the turned views and, for a mesh, the same views rendered anew.
 """
 
 import argparse
-import sys
-import tempfile
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _begin import fail, make_folder
 from PIL import Image
 
 from jaxfx import PinholeCamera, exr, relight, reproject, scene
@@ -64,19 +63,9 @@ def load(arguments: argparse.Namespace):
 
         return *taken(eye), eye, lambda eye: taken(eye)[0]
     except KeyError as error:
-        sys.exit(f"orbit.py: error: --picture must hold colour and `depth`, it lacks {error}")
+        fail(f"--picture must hold colour and `depth`, it lacks {error}")
     except (OSError, ValueError, RuntimeError) as error:
-        sys.exit(f"orbit.py: error: {error}")
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than at the end."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        sys.exit(f"orbit.py: error: --out must be a folder to write to: {error}")
-    return folder
+        fail(error)
 
 
 def turned(eye: PinholeCamera, degrees: float, distance: float) -> PinholeCamera:
@@ -109,7 +98,7 @@ def main() -> None:
     image, depth, eye, render = load(arguments)
     seen = np.asarray(depth)[np.isfinite(depth) & (np.asarray(depth) > 0)]
     if not seen.size:
-        sys.exit("orbit.py: error: the picture has no depth anywhere")
+        fail("the picture has no depth anywhere")
     distance = float(np.median(seen))
 
     view = jax.jit(lambda target: reproject.warp(image, depth, eye, target))

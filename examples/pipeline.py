@@ -19,11 +19,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import _common
+import _pipeline
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _begin import fail, make_folder
 from jaxtyping import Array, Float
 
 from jaxfx import dof, fit, relight, reproject, scene, shadow
@@ -80,7 +81,7 @@ def parse() -> argparse.Namespace:
     add("--noise", type=float, default=0.01, help="of the target, its standard deviation")
     add("--out", type=Path, default=Path("out"), help="folder to write to")
     least = {"height": 24, "map_size": 16, "starts": 1, "steps": 1, "seed": 0, "noise": 0}
-    return _common.parsed(parser, least)
+    return _pipeline.parsed(parser, least)
 
 
 class Stage(eqx.Module):
@@ -244,7 +245,7 @@ def set_stage(path: Path | None, height: int, map_size: int) -> tuple[Mesh, Stag
         base = floats(scene.default_camera(loaded, height=shape[0], width=shape[1]))
         middle = Mesh(loaded, np.zeros(3), 1.0, map_size).gbuffer(base, shape)
     except (OSError, ValueError, RuntimeError) as error:
-        _common.fail(error)
+        fail(error)
     seen = np.isfinite(middle.depth)
     distance = float(np.median(middle.depth[seen]))
     points = base.unproject(pixel_centers(*shape), jnp.where(seen, middle.depth, 1))
@@ -277,10 +278,10 @@ def search(mesh: Mesh, stage: Stage, start: np.ndarray, target: Image, steps: in
         rest = stage, mesh.cast(stage.light(jnp.asarray(numbers, float)))
         if free > ROUNDS[index - 1][1]:
             numbers = best_lens(numbers, target, *rest)
-        model = lambda each, rest=(*rest, target, sigma): _common.equations(
+        model = lambda each, rest=(*rest, target, sigma): _pipeline.equations(
             *forward(jnp.asarray(each, float), *rest)
         )
-        numbers, loss, squares, taken = _common.descend(model, numbers, free, steps)
+        numbers, loss, squares, taken = _pipeline.descend(model, numbers, free, steps)
         count += taken
     went = {"rms": np.sqrt(loss), "steps": count, "seconds": time.perf_counter() - begun}
     return numbers, went, np.linalg.pinv(squares, hermitian=True) * loss / target.size
@@ -331,12 +332,12 @@ def times_of(numbers: Numbers, stage: Stage, cast: Shadow, target: Image) -> tup
         "13 derivatives, forward": lambda: forward(numbers, *rest),
         "gradient, reverse": lambda: reverse(numbers, *rest),
     }
-    return {name: _common.timed(name, call, given) for name, call in stages.items()}, given
+    return {name: _pipeline.timed(name, call, given) for name, call in stages.items()}, given
 
 
 def main() -> None:
     arguments = parse()
-    out, seed, steps = _common.make_folder(arguments.out), arguments.seed, arguments.steps
+    out, seed, steps = make_folder(arguments.out), arguments.seed, arguments.steps
     mesh, stage, truth = set_stage(arguments.scene, arguments.height, arguments.map_size)
     numbers = jnp.asarray(truth, float)
     camera, light, lens = stage.camera(numbers), stage.light(numbers), stage.lens(numbers)
@@ -346,16 +347,16 @@ def main() -> None:
     milliseconds, given = times_of(numbers, stage, cast, from_mesh)
     view, (image, jacobian) = given["new view"], given["13 derivatives, forward"]
     images = {
-        "a frame buffer, from its own camera": _common.shown(stage.caches[-1].diffuse),
-        "the new view: reflectance": _common.shown(view.diffuse),
+        "a frame buffer, from its own camera": _pipeline.shown(stage.caches[-1].diffuse),
+        "the new view: reflectance": _pipeline.shown(view.diffuse),
         "the new view: focus / depth": np.clip(lens.focus_distance / view.depth / 2, 0, 1),
-        "light and shadow": _common.shown(given["light and shadow"]),
-        "depth of field": _common.shown(given["depth of field"]),
-        "the same from the mesh itself": _common.shown(from_mesh),
+        "light and shadow": _pipeline.shown(given["light and shadow"]),
+        "depth of field": _pipeline.shown(given["depth of field"]),
+        "the same from the mesh itself": _pipeline.shown(from_mesh),
     }
-    _common.write_panels(out / "stages.png", images)
-    images = {NAMES[i]: _common.gray(jacobian[..., i]) for i in (0, 4, 6, 8, 11, 12)}
-    _common.write_panels(out / "derivatives.png", images)
+    _pipeline.write_panels(out / "stages.png", images)
+    images = {NAMES[i]: _pipeline.gray(jacobian[..., i]) for i in (0, 4, 6, 8, 11, 12)}
+    _pipeline.write_panels(out / "derivatives.png", images)
 
     noise = np.random.default_rng(seed).normal(0, arguments.noise, image.shape)
     target = (from_mesh if arguments.of_mesh else given["picture"]) + jnp.asarray(noise, float)
@@ -368,15 +369,15 @@ def main() -> None:
     ends = (jnp.asarray(each, float) for each in (starts[0], values))
     first, last = (draw(each, stage, mesh.cast(stage.light(each))) for each in ends)
     images = {"target": target, "start": first, "found": last}
-    images = {name: _common.shown(image) for name, image in images.items()}
-    images["start, less the target"] = _common.gray(first - target, 1.0)
-    images["found, less the target, 5 times"] = _common.gray(last - target, 0.2)
-    _common.write_panels(out / "fit.png", images)
+    images = {name: _pipeline.shown(image) for name, image in images.items()}
+    images["start, less the target"] = _pipeline.gray(first - target, 1.0)
+    images["found, less the target, 5 times"] = _pipeline.gray(last - target, 0.2)
+    _pipeline.write_panels(out / "fit.png", images)
     errors = {"start": sizes(starts[0] - truth, truth)}
     errors |= {name: sizes(values - truth, truth) for name, (values, *_) in found.items()}
     deviations, hardest = expected(covariance)
     errors["std. error"] = sizes(deviations, truth)
-    slope = 2 * _common.equations(image, jacobian)[1]
+    slope = 2 * _pipeline.equations(image, jacobian)[1]
     apart = np.max(np.abs(given["gradient, reverse"] - slope)) / np.max(np.abs(slope))
     report = {
         "height": arguments.height,
@@ -388,7 +389,7 @@ def main() -> None:
         "hardest to tell apart": hardest,
     }
     write_whole(out / "report.json", json.dumps(report, indent=2).encode())
-    _common.print_table(errors)
+    _pipeline.print_table(errors)
     for name, went in report["searches"].items():
         print(name + ", ".join(f" {key} {value:.3g}" for key, value in went.items()))
     print(f"hardest to tell apart: {hardest}")

@@ -14,15 +14,13 @@ column.
 import argparse
 import io
 import math
-import sys
-import tempfile
 from fractions import Fraction
 from pathlib import Path
-from typing import NoReturn
 
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from _begin import fail, make_folder
 from tqdm.auto import tqdm
 
 from jaxfx import ThinLens, dof, exr
@@ -41,10 +39,6 @@ METHODS = {
 LARGEST_COC = 0.025
 # Where no focal length is known: that of a field of view of 60 degrees across.
 FOCAL_PER_WIDTH = 0.5 / math.tan(math.radians(30))
-
-
-def fail(message: object) -> NoReturn:
-    sys.exit(f"refocus.py: error: {message}")
 
 
 def positive(text: str) -> float:
@@ -206,12 +200,7 @@ def save_figure(pictures: dict, depth, missing, path: Path) -> None:
 
 def main() -> None:
     arguments = parse()
-    out = arguments.out
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out).close()
-    except OSError as error:
-        fail(f"--out must be a folder to write to: {error}")
+    out = make_folder(arguments.out)
     try:
         color = read_color(arguments.color)
         measured = read_depth(arguments.depth, arguments.depth_scale)

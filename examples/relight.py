@@ -11,8 +11,6 @@ import json
 import logging
 import os
 import statistics
-import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from _begin import fail, make_folder
 from PIL import Image
 
 from jaxfx import PinholeCamera, SpotLight, exr, metrics, relight, reproject, scene, shadow
@@ -114,18 +113,8 @@ def set_stage(path: Path | None, height: int) -> Stage:
         stage = Stage(mesh, camera, middle, height, width)
         stage.gbuffer(camera)
     except (OSError, ValueError, RuntimeError) as error:
-        sys.exit(f"relight.py: error: {error}")
+        fail(error)
     return stage
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than after the work."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        sys.exit(f"relight.py: error: --out must be a folder to write to: {error}")
-    return folder
 
 
 @jax.jit

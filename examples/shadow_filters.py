@@ -13,16 +13,15 @@ import json
 import logging
 import os
 import statistics
-import sys
-import tempfile
 import time
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from _begin import fail, make_folder
 from tqdm.auto import tqdm
 
 from jaxfx import AmbientLight, DirectionalLight, exr, relight, scene, shadow
@@ -65,20 +64,6 @@ def parse() -> argparse.Namespace:
         if size < 1 or size % 2 == 0:
             parser.error(f"--filters must be odd numbers from 1, got {size}")
     return arguments
-
-
-def fail(message: object) -> NoReturn:
-    sys.exit(f"shadow_filters.py: error: {message}")
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than after the work."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        fail(f"--out must be a folder to write to: {error}")
-    return folder
 
 
 class Stage(NamedTuple):

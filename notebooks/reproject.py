@@ -93,8 +93,8 @@ plt.show()
 # %% [markdown]
 # One ray on its way, step by step. A bar is the cell that it looks at: as wide as the cell, at
 # the cell's depth. Where the ray reaches the bar it goes down two levels; where it leaves the
-# cell, to the next one, and up a level if it also leaves the cell two levels above. No ray leaves
-# a cell without looking at its neighbour: this is what makes the search exact.
+# cell, to the next one, and up a level if it also leaves the cell two levels above. No ray
+# leaves a cell without looking at its neighbour: this is what makes the search exact.
 
 # %%
 size = 64

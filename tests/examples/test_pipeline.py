@@ -28,7 +28,7 @@ def example():
     module.ROUNDS = module.ROUNDS[1], module.ROUNDS[-1], module.ROUNDS[-1]
     module.OFF = module.OFF / 2
     module.draw = module.picture
-    module.reverse = lambda *rest: 2 * module._common.equations(*module.forward(*rest))[1]
+    module.reverse = lambda *rest: 2 * module._pipeline.equations(*module.forward(*rest))[1]
     return module
 
 

@@ -1,14 +1,12 @@
-"""What examples share: how they begin, measure, write, and end where they can't go on."""
+"""What `pipeline.py` needs but does not show: its search, its measures, its panels."""
 
 import argparse
 import io
 import statistics
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import jax
 import matplotlib
@@ -22,10 +20,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-def fail(message: object) -> NoReturn:
-    sys.exit(f"{Path(sys.argv[0]).name}: error: {message}")
-
-
 def parsed(parser: argparse.ArgumentParser, least: Mapping[str, float]) -> Any:
     """The arguments, no number of them below what is the least."""
     arguments = parser.parse_args()
@@ -33,16 +27,6 @@ def parsed(parser: argparse.ArgumentParser, least: Mapping[str, float]) -> Any:
         if not (value := getattr(arguments, name)) >= bound:
             parser.error(f"--{name.replace('_', '-')} must be at least {bound}, got {value}")
     return arguments
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than after the work."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        fail(f"--out must be a folder to write to: {error}")
-    return folder
 
 
 def timed(name: str, call: Callable[[], Any], given: dict[str, Any]) -> float:
