@@ -81,7 +81,8 @@ def layered(
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
     every field of `lens`, forward and reverse; zero where a sprite is clamped. At a kink (an
-    equal depth of neighbours, the ends of every clamp) one of the one-sided values.
+    equal depth of neighbours, the ends of every clamp) one of the one-sided values; where
+    several meet, as at neighbours that all have one depth, it can lie beyond all of them.
 
     Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
     pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.
