@@ -164,6 +164,7 @@ def weight(offset: Float[Array, "*place"], size: int, kernel: Kernel) -> Float[A
 
 
 def taps(size: int) -> range:
+    """The offsets of a filter's taps along one axis, in texels."""
     return range(-(size // 2), size // 2 + 1)
 
 

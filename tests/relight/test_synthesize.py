@@ -1,4 +1,4 @@
-"""New views against a plain loop. (Against fresh caches, and where two surfaces might blend:
+"""New views against a plain loop and against fresh caches. (Where two surfaces might blend:
 `tests/stability`.)"""
 
 import functools
@@ -25,7 +25,7 @@ from relight_views import (
     points,
 )
 
-from jaxfx import OrthographicCamera, PinholeCamera, relight
+from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
 
 
 quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -279,6 +279,48 @@ def test_best_caches_passes_over_one_that_looks_away():
     depth = FRONTAL(TARGET).depth
     order = relight.best_caches(gbuffers, cameras, TARGET, depth=depth, count=4, stride=3)
     assert int(order[-1]) == 0
+
+
+def psnr(image, reference, mask=None):
+    return float(metrics.psnr(image, reference, mask=mask))
+
+
+def new_view(caches, count, degrees):
+    gbuffers, cameras = (each[:count] for each in caches)
+    target = orbit(degrees, 0.1, LARGE)
+    truth = cache(target, LARGE)
+    found, coverage = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
+    return target, truth, found, np.asarray(coverage)
+
+
+@pytest.mark.parametrize("degrees", [5, 15, 30])
+def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
+    """PSNR of every parameter, ids exact, and the relit picture, filled and outside holes."""
+    shares = []
+    for count in (1, 2, 4, 8):
+        target, truth, found, coverage = new_view(caches, count, degrees)
+        shown = np.asarray(truth.shader) >= 0
+        seen = coverage > 0
+        assert not seen[~shown].any() and coverage.max() <= count
+        shares.append(seen[shown].mean())
+        assert set(np.unique(found.shader)) <= {-1, 0, 2}
+        wrong = np.asarray(found.shader != truth.shader)[seen]
+        assert wrong.mean() < 0.005
+        for name in ("color", "diffuse", "specular", "normal"):
+            assert psnr(getattr(found, name), getattr(truth, name), seen) > 18, name
+        np.testing.assert_array_equal(found.depth, truth.depth)
+        length = np.linalg.norm(np.asarray(found.normal), axis=-1)
+        np.testing.assert_allclose(length, seen, atol=1e-5)
+
+        filled, holes = relight.fill_holes(found, coverage)
+        assert int(holes) == (shown & ~seen).sum()
+        assert (np.asarray(filled.shader)[shown] >= 0).all()
+        lights = scene.default_lights(target)
+        pictures = [relight.render(each, target, lights) for each in (truth, found, filled)]
+        assert psnr(pictures[2], pictures[0]) >= psnr(pictures[1], pictures[0])
+        assert psnr(pictures[1], pictures[0], seen) > 20
+    assert shares == sorted(shares) and shares[0] > 0.4
+    assert shares[-1] > {5: 0.98, 15: 0.95, 30: 0.8}[degrees]
 
 
 def test_errors_name_the_argument():
