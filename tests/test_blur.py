@@ -1,6 +1,7 @@
 """Blur against NumPy's plain sums and SciPy, the paper's numbers, and where it fails."""
 
 import inspect
+import math
 
 import jax
 import jax.numpy as jnp
@@ -116,6 +117,18 @@ def test_both_samplings_agree_to_rounding():
     assert np.abs(discrete - linear).max() < 18 * 2e-7
 
 
+def test_dividing_by_the_whole_row_would_darken():
+    ones = np.ones((16, 16, 1))
+    kept = np.array([math.comb(12, i) for i in range(2, 11)])
+    darkened = ones
+    for passes in range(1, 10):
+        darkened = by_scipy(darkened, kept / 4096)
+        # 1.3 % darker with each pass, a tenth after nine.
+        np.testing.assert_allclose(darkened, (4070 / 4096) ** (2 * passes))
+    assert darkened.max() < 0.892
+    np.testing.assert_allclose(blur.gaussian(ones, passes=9), 1, rtol=1e-14)
+
+
 def test_four_passes_of_9_reach_as_far_as_33_taps():
     point = np.zeros((41, 41, 1))
     point[20, 20] = 1
@@ -145,6 +158,44 @@ def test_scipys_gaussian():
     np.testing.assert_allclose(out[..., 0], expected, rtol=1e-13)
 
 
+def spread_of(sigma, taps, passes=1):
+    reach = passes * (taps // 2)
+    point = np.zeros((1, 2 * reach + 1, 1))
+    point[0, reach] = 1
+    out = blur.gaussian(point, taps=taps, passes=passes, sigma=sigma)
+    return (
+        float(np.sum(np.asarray(out).ravel() * (np.arange(2 * reach + 1) - reach) ** 2)) ** 0.5
+    )
+
+
+def test_a_sigma_that_the_taps_do_not_hold_falls_short_as_documented():
+    """Of 9 taps: 2 % at a sigma of 1.5, 13 % at 2, 40 % at 4; and no more than a box."""
+    for passes in (1, 4):
+        n = passes**0.5
+        assert spread_of(9 / 5 * n * 0.75, 9, passes) == pytest.approx(
+            9 / 5 * n * 0.75, rel=0.02
+        )
+        assert 0.9 < spread_of(9 / 5 * n, 9, passes) / (9 / 5 * n) < 0.96
+        assert spread_of(4 * n, 9, passes) / (4 * n) < 0.62
+        assert spread_of(1e3, 9, passes) == pytest.approx((passes * 80 / 12) ** 0.5, rel=1e-4)
+
+
+@pytest.mark.parametrize("sampling", ["discrete", "linear"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_sigma_0_is_the_identity_with_a_gradient_of_0(sampling, dtype):
+    image = jnp.asarray(picture(12, 14, dtype=dtype))
+
+    @jax.jit
+    def both(sigma):
+        blurred = lambda sigma: blur.gaussian(image, sampling=sampling, sigma=sigma)
+        return jax.jvp(blurred, (sigma,), (jnp.ones_like(sigma),))
+
+    for sigma in (0.0, 1e-30, 1e-3, 0.02):
+        out, slope = both(jnp.asarray(sigma))
+        np.testing.assert_array_equal(out, image)
+        np.testing.assert_array_equal(slope, 0)
+
+
 def test_gradients_in_sigma_and_the_image_are_differences():
     image, bar = (jnp.asarray(picture(14, 12, c)[..., :2]) for c in (2, 3))
 
@@ -159,6 +210,37 @@ def test_gradients_in_sigma_and_the_image_are_differences():
         move = jnp.zeros_like(image).at[pixel].set(1e-5)
         difference = (loss(image + move, 1.3) - loss(image - move, 1.3)) / 2e-5
         np.testing.assert_allclose(by_image[pixel], difference, rtol=1e-8)
+
+
+@pytest.mark.parametrize("sampling", ["discrete", "linear"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("pixel", [(10, 12), (0, 0), (3, 25), (20, 2)])
+def test_a_bad_pixel_spoils_what_its_taps_reach(pixel, value, sampling):
+    image = picture(21, 26)
+    image[*pixel, 1] = value
+    out = np.asarray(blur.gaussian(image, sampling=sampling))
+    y, x = np.mgrid[:21, :26]
+    near = (abs(y - pixel[0]) <= 4) & (abs(x - pixel[1]) <= 4)
+    np.testing.assert_array_equal(~np.isfinite(out[..., 1]), near)
+    assert np.isfinite(out[..., ::2]).all()
+
+
+def test_a_constant_stays():
+    for sigma in (None, 2.0):
+        out = blur.gaussian(np.full((17, 19, 3), 0.3, np.float32), passes=4, sigma=sigma)
+        np.testing.assert_allclose(out, 0.3, rtol=1e-6)
+
+
+def test_bytes_round_where_floats_do_not():
+    """Rounded to 256 steps after each of 9 passes, a faint slope turns to steps."""
+    slope = np.tile(np.linspace(0.10, 0.12, 64)[None, :, None], (8, 1, 1))
+    exact = np.asarray(blur.gaussian(slope, passes=9))
+    stepped = slope
+    for _ in range(9):
+        stepped = np.round(255 * np.asarray(blur.gaussian(stepped))) / 255
+    assert np.abs(stepped - exact).max() > 0.4 / 255
+    single = np.asarray(blur.gaussian(slope.astype(np.float32), passes=9))
+    assert np.abs(single - exact).max() < 1e-7
 
 
 @pytest.mark.parametrize("taps", [2, 4, 6])

@@ -149,6 +149,24 @@ def test_a_chain_of_edits_of_several_kinds_does_not_drift():
     assert drift(state) < 1e-6
 
 
+def test_ten_thousand_edits_in_a_loop_do_not_drift():
+    """The worst chain: the same two lights in turn, so that what is lost is lost each time."""
+    one, two, three = make_lights(3, kinds=(point,))
+
+    @jax.jit
+    def chain(state):
+        def step(state, _):
+            for i in (0, 1):
+                for light in (two, one, three):
+                    state = state.edit(i, light)
+            return state, None
+
+        return jax.lax.scan(step, state, None, length=10_000 // 6)[0]
+
+    state = relight.start(SINGLE, CAMERA, [three, three, two])
+    assert drift(chain(state)) < 1e-6
+
+
 def test_a_bright_light_leaves_no_trace():
     lights = make_lights(3, kinds=(point,))
     state = relight.start(SINGLE, CAMERA, lights)
@@ -176,6 +194,24 @@ def test_a_bad_pixel_stays_where_it_is():
     state = relight.start(bad, CAMERA, make_lights(4)).edit(0, make_lights(1, seed=9)[0])
     wrong = np.isnan(np.asarray(state.image)).any(axis=-1)
     assert wrong[2, 3] and wrong.sum() == 1
+
+
+@pytest.mark.parametrize("count", [10, 100, 1000])
+def test_the_work_of_an_edit_does_not_depend_on_the_number_of_lights(count):
+    """Counted in what is compiled; `tests/benchmarks` has the times."""
+
+    def work(count):
+        lights = make_lights(1, kinds=(point,)) * count
+        state = eqx.tree_at(
+            lambda s: (s.lights, s.visibilities),
+            relight.start(GBUFFER, CAMERA, lights[:1]),
+            (tuple(lights), (None,) * count),
+        )
+        edit = jax.jit(lambda state, light: state.edit(0, light).image)
+        cost = edit.lower(state, lights[0]).compile().cost_analysis()
+        return cost["flops"], cost["bytes accessed"]
+
+    np.testing.assert_allclose(work(count), work(1), rtol=0.01)
 
 
 @pytest.mark.parametrize("make", KINDS, ids=lambda make: make.__name__)

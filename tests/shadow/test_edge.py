@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shadow_failures import noise, steps
 from shadow_scenes import plate
 
 from jaxfx import shadow
@@ -15,14 +14,39 @@ from jaxfx.shadow import _compact
 from jaxfx.shadow._windows import extremes, unions
 from jaxfx.shadow.edge import usual_dilation
 
-from .conftest import naive_pcf
+from .conftest import naive_pcf, random_case
+
+
+def steps_case(seed, dtype=np.float32):
+    """A map of a few flat depths with single texels among them: windows that agree exist."""
+    rng = np.random.default_rng(seed)
+    shadow_map = np.repeat(np.repeat(rng.choice([1.0, 2.0, np.inf], (4, 5)), 16, 0), 16, 1)
+    shadow_map[rng.integers(0, 64, 5), rng.integers(0, 80, 5)] = rng.uniform(0.5, 3, 5)
+    u, v = (rng.uniform(-6, count + 6, (40, 50)) for count in (80, 64))
+    z = rng.choice([-1.0, 1.0, 1.5, 2.0, 2.5, np.nan, np.inf], (40, 50))
+    fields = (u, v, z, rng.uniform(0, 0.2, (40, 50)))
+    return shadow_map.astype(dtype), shadow.Receivers(*(jnp.asarray(f, dtype) for f in fields))
+
+
+SIZES = [(size, np.float32) for size in (1, 3, 7, 15, 31)] + [(5, np.float64)]
+
+
+@pytest.mark.parametrize(("size", "dtype"), SIZES)
+def test_depth_mask_is_pcf_to_the_last_bit(size, dtype):
+    cases = [steps_case(seed, dtype) for seed in (0, 1)]
+    cases += [random_case(seed, (64, 80), (40, 50), dtype) for seed in (2, 3)]
+    for case in cases:
+        for slope_bias in (0.0, 0.7):
+            options = {"size": size, "bias": 0.013, "slope_bias": slope_bias}
+            visible = shadow.edge_pcf(*case, mask="depth", **options)
+            np.testing.assert_array_equal(visible, shadow.pcf(*case, **options))
 
 
 @pytest.mark.parametrize(
     ("kernel", "softness"), [("box", 0.2), ("tent", None), ("gaussian", 0.2)]
 )
 def test_depth_mask_is_pcf_in_every_form(kernel, softness):
-    case = steps(3)
+    case = steps_case(3)
     options = {"size": 5, "kernel": kernel, "softness": softness, "bias": 0.02}
     visible = shadow.edge_pcf(*case, mask="depth", **options)
     np.testing.assert_allclose(visible, shadow.pcf(*case, **options), atol=1e-6)
@@ -30,7 +54,7 @@ def test_depth_mask_is_pcf_in_every_form(kernel, softness):
 
 @pytest.mark.parametrize("size", [3, 9])
 def test_depth_mask_is_where_the_comparisons_differ(size):
-    case = steps(4, np.float64)
+    case = steps_case(4, np.float64)
     found = shadow.candidates(*case, size=size, mask="depth")
     share = naive_pcf(
         case[0], case[1]._replace(z=np.where(np.isfinite(case[1].z), case[1].z, -1)), size
@@ -64,12 +88,12 @@ def test_chunks_run_as_many_as_there_are_candidates():
         return total + jnp.sum(pixels < size)
 
     size = 3 * _compact._CHUNK
-    for count_set, chunks in ((0, 0), (1, 1), (_compact._CHUNK, 1), (_compact._CHUNK + 1, 2)):
+    for count_set, steps in ((0, 0), (1, 1), (_compact._CHUNK, 1), (_compact._CHUNK + 1, 2)):
         calls.clear()
         where = jnp.arange(size) < count_set
         assert _compact.fold(where, 0, lambda pixels: pixels, count) == count_set
         jax.effects_barrier()
-        assert len(calls) == chunks
+        assert len(calls) == steps
 
 
 @pytest.mark.parametrize(
@@ -87,6 +111,16 @@ def test_running_extremes(shape, size):
     np.testing.assert_array_equal(unions(jnp.asarray(bits), size), seen)
 
 
+# The screen mask's losses: a wall at depth 2 with a floor at 4, seen at some magnification.
+
+
+@pytest.mark.parametrize("magnification", [0.25, 1.0, 8.0])
+def test_screen_mask_with_enough_dilation_loses_no_wide_shadow(magnification):
+    case = plate(magnification, 16 if magnification < 8 else 6)
+    screen = shadow.edge_pcf(*case, size=7, mask="screen")
+    np.testing.assert_array_equal(screen, shadow.pcf(*case, size=7))
+
+
 def test_a_grazed_surface_does_not_make_the_dilation_the_picture():
     """A tenth of the rows lie along the light, where a filter covers ever more pixels."""
     shadow_map, receivers = plate(2.0, 16)
@@ -96,6 +130,36 @@ def test_a_grazed_surface_does_not_make_the_dilation_the_picture():
         for each in (receivers, grazed)
     ]
     assert found == [4 * 2 + 1] * 2
+
+
+def test_screen_mask_misses_less_the_farther_edges_reach():
+    case = plate(4.0, 4)
+    full = shadow.pcf(*case, size=7)
+    differing = [
+        int(jnp.sum(shadow.edge_pcf(*case, size=7, dilation=d) != full)) for d in (1, 16)
+    ]
+    assert differing == sorted(differing, reverse=True)
+    assert differing[0] > 96
+    assert differing[-1] == 0
+
+
+def test_screen_mask_loses_a_shadow_between_pixels():
+    """One texel wide, seen at a quarter: pixels step over it, so that it has no edge."""
+    shadow_map, receivers = plate(0.25, 1, side=16)
+    receivers = receivers._replace(u=receivers.u + 2.0)
+    assert (shadow.hard(shadow_map, receivers) == 1).all()
+    full = shadow.pcf(shadow_map, receivers, size=7)
+    assert full.min() < 1
+    assert (shadow.edge_pcf(shadow_map, receivers, size=7, dilation=3) == 1).all()
+    exact = shadow.edge_pcf(shadow_map, receivers, size=7, mask="depth")
+    np.testing.assert_array_equal(exact, full)
+
+
+def test_screen_mask_loses_an_edge_beyond_the_frame():
+    """The filter reaches the plate's ends, which the picture does not show."""
+    case = plate(8.0, 16)
+    assert (shadow.edge_pcf(*case, size=7) == 0).all()
+    assert shadow.pcf(*case, size=7).max() == pytest.approx(1 / 7)
 
 
 def test_nothing_to_filter_is_nothing_done(case):
@@ -108,7 +172,7 @@ def test_nothing_to_filter_is_nothing_done(case):
 
 
 def test_derivatives_are_pcfs():
-    shadow_map, receivers = noise()
+    shadow_map, receivers = random_case()
     options = {"size": 3, "kernel": "tent"}
 
     def loss(function, shadow_map, z, bias, softness):

@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shadow_failures import noise
 
 from jaxfx import shadow
 
-from .conftest import naive_pcf
+from .conftest import naive_pcf, random_case
 
 
 KERNELS = ("box", "tent", "gaussian")
@@ -42,7 +41,7 @@ def test_the_example_of_the_source():
 
 
 def test_prefiltered_is_the_mean_compared_once():
-    shadow_map, receivers = noise(map_shape=(20, 20))
+    shadow_map, receivers = random_case(map_shape=(20, 20))
     shadow_map = np.where(np.isinf(shadow_map), 2.0, shadow_map)
     visible = np.asarray(shadow.prefiltered(shadow_map, receivers, size=5))
     padded = np.pad(shadow_map, 10, constant_values=np.inf)
@@ -51,6 +50,19 @@ def test_prefiltered_is_the_mean_compared_once():
         x, y = int(np.floor(u)) + 10, int(np.floor(v)) + 10
         mean = padded[y - 2 : y + 3, x - 2 : x + 3].mean()
         assert visible[j, i] == (z <= 0 or mean >= z)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("softness", [None, 0.3])
+def test_what_is_lit_whatever_the_map_says(kernel, softness):
+    options = {"size": 3, "kernel": kernel, "softness": softness}
+    wall = np.ones((4, 5))
+    for u, v, z in [(-9, 2, 5), (99, 2, 5), (2, -9, 5), (2, 99, 5), (2, 2, -1), (2, 2, 0)]:
+        assert shadow.pcf(wall, one(u, v, z), **options)[0, 0] == 1
+    for wrong in [one(np.nan, 2, 5), one(2, np.inf, 5), one(2, 2, np.nan), one(2, 2, np.inf)]:
+        assert shadow.pcf(wall, wrong, **options)[0, 0] == 1
+    assert shadow.pcf(np.full((4, 5), np.inf), one(2, 2, 5), **options)[0, 0] == 1
+    assert shadow.pcf(wall, one(2, 2, 5), **options)[0, 0] == pytest.approx(0, abs=1e-15)
 
 
 def test_equal_depth_is_lit():
@@ -83,7 +95,7 @@ def test_a_bad_texel_or_receiver_spoils_only_its_own(case, kernel):
 
 @pytest.mark.parametrize("map_shape", [(1, 1), (1, 9), (3, 2)])
 def test_a_map_smaller_than_the_filter(map_shape):
-    case = noise(map_shape=map_shape)
+    case = random_case(map_shape=map_shape)
     np.testing.assert_allclose(shadow.pcf(*case, size=7), naive_pcf(*case, 7), atol=1e-15)
 
 
@@ -113,10 +125,22 @@ def test_other_faults_name_their_argument(case):
         pcf(np.ones((3, 3), int), receivers, size=3)
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_softness_tends_to_the_hard_picture(case, kernel):
+    sharp = shadow.pcf(*case, size=5, kernel=kernel)
+    gaps = [
+        np.abs(shadow.pcf(*case, size=5, kernel=kernel, softness=width) - sharp).max()
+        for width in (1.0, 0.1, 1e-2, 1e-6)
+    ]
+    assert gaps == sorted(gaps, reverse=True)
+    assert gaps[0] > 0.05
+    assert gaps[-1] < 1e-12
+
+
 @pytest.mark.parametrize("kernel", ["tent", "gaussian"])
 def test_weights_that_follow_the_receiver_are_continuous(kernel):
     """Across a texel's border the box jumps, the others do not."""
-    shadow_map = noise(seed=2)[0]
+    shadow_map = random_case(seed=2)[0]
 
     def at(u, kernel):
         return float(shadow.pcf(shadow_map, one(u, 7.3, 2.0), size=5, kernel=kernel)[0, 0])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from shadow_scenes import WHITE, Still
+from shadow_scenes import WHITE, Still, acne_and_leaks
 
 from jaxfx import PointLight, shadow
 
@@ -13,6 +13,30 @@ pytest.importorskip("embreex", reason="the truth is traced by Embree")
 @pytest.fixture(scope="module")
 def stage():
     return Still()
+
+
+def test_acne_falls_and_leaks_grow_with_both_biases(stage):
+    """Ten units across, 512 texels. Half of all is acne without a bias."""
+    data, truth = stage.under_the_sun(512), stage.truth(-Still.sun)
+    grid = [
+        [
+            acne_and_leaks(shadow.hard(*data, bias=b, slope_bias=s), *truth)
+            for s in (0.0, 0.5, 2.0)
+        ]
+        for b in (0.0, 0.01, 0.1, 0.5)
+    ]
+    acne, leaks = np.moveaxis(np.array(grid), -1, 0)
+    for axis in (0, 1):
+        assert (np.diff(acne, axis=axis) <= 0).all()
+        assert (np.diff(leaks, axis=axis) >= 0).all()
+    assert acne[0, 0] > 0.4
+    # Half a texel of slope is all that a plane needs; a constant bias needs a tenth of a unit.
+    assert acne[0, 1] < 0.005
+    assert leaks[0, 1] < 0.04
+    assert acne[1, 0] > 0.1
+    assert acne[2, 0] < 0.005
+    # Half a unit lets the light under what stands on the floor.
+    assert leaks[3, 0] > 0.15
 
 
 def test_a_finer_map_errs_less(stage):
