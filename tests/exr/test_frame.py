@@ -1,6 +1,9 @@
-"""Deep frame buffers in EXR files."""
+"""Deep frame buffers in EXR files: read by us, OpenImageIO and Blender, named as Nuke does."""
 
+import pathlib
 import re
+import shutil
+import subprocess
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -83,27 +86,94 @@ def test_the_passes_are_layers(tmp_path):
     }
     flat = {"normal.X", "normal.Y", "normal.Z", "depth.Z", "shader.V", "roughness.V"}
     assert names == colors | flat
-    # What Blender and Nuke ask of a name that they are to show as it is: one dot; a layer of
-    # letters alone, which neither cleans; and a single letter that both know, or V.
-    assert all(re.fullmatch(r"[a-z]+\.([RGBAXYZ]|V)", name) for name in names)
-    # Nuke keeps this name for depth, and Blender takes bare X, Y and Z for a vector.
-    assert "depth.Z" in names and not names & set("XYZ")
 
 
-def test_another_reader_finds_the_passes(tmp_path):
-    """OpenImageIO, by which many programs read EXR files."""
-    before = gbuffer()
-    exr.write_gbuffer(tmp_path / "a.exr", before, camera=camera(PinholeCamera, np.float32))
-    file = OpenImageIO.ImageInput.open(str(tmp_path / "a.exr"))
-    names, pixels = file.spec().channelnames, file.read_image("float")
+@pytest.fixture
+def file(tmp_path):
+    """A deep frame buffer and the file that holds it."""
+    path, before = tmp_path / "a.exr", gbuffer()
+    exr.write_gbuffer(path, before, camera=camera(PinholeCamera, np.float32))
+    return before, path
+
+
+def test_open_image_io_finds_the_passes(file):
+    """The library by which many programs read EXR files."""
+    before, path = file
+    found = OpenImageIO.ImageInput.open(str(path))
+    names, pixels = found.spec().channelnames, found.read_image("float")
     for name in PASSES:
-        found = [i for i, channel in enumerate(names) if channel.startswith(f"{name}.")]
+        own = [i for i, channel in enumerate(names) if channel.startswith(f"{name}.")]
         # Red before green before blue, as X before Y before Z, whatever the order on disk.
-        assert [names[i][-1] for i in found] in (["R", "G", "B"], ["X", "Y", "Z"], ["Z"], ["V"])
+        assert [names[i][-1] for i in own] in (["R", "G", "B"], ["X", "Y", "Z"], ["Z"], ["V"])
         layer = np.asarray(getattr(before, name)).reshape(5, 7, -1)
-        np.testing.assert_array_equal(pixels[..., found], layer)
-    kept = np.reshape(file.spec().getattribute("jaxfx.world_from_camera"), (4, 4))
+        np.testing.assert_array_equal(pixels[..., own], layer)
+    kept = np.reshape(found.spec().getattribute("jaxfx.world_from_camera"), (4, 4))
     np.testing.assert_array_equal(kept.astype(np.float32), matrix(1, 4, np.float32))
+
+
+def test_blender_finds_the_passes(file, tmp_path):
+    """Its compositor shows each pass under its name, and every bit of every number."""
+    blender = shutil.which("blender")
+    if blender is None:
+        pytest.skip("Blender is not installed, e.g. by apt-get install blender")
+    before, path = file
+    script, folder = pathlib.Path(__file__).with_name("blender_passes.py"), tmp_path / "passes"
+    options = ["--background", "--factory-startup", "--python-exit-code", "1"]
+    command = [blender, *options, "--python", script, "--", path, folder]
+    subprocess.run(command, check=True, timeout=100, capture_output=True)
+    assert {file.name for file in folder.iterdir()} == {f"{name}0001.exr" for name in PASSES}
+    for name in PASSES:
+        saved = OpenEXR.File(str(folder / f"{name}0001.exr"), separate_channels=True).channels()
+        layer = np.asarray(getattr(before, name), np.float32).reshape(5, 7, -1)
+        for letter, plane in zip("RGB", np.moveaxis(layer, -1, 0), strict=False):
+            np.testing.assert_array_equal(saved[letter].pixels, plane)
+
+
+def nuke_name(channel):
+    """What Nuke calls a channel of an EXR file, by the source of its reader.
+
+    Foundry publishes that source with its development kit. The name is cut at its first two
+    dots. Leading digits and empty parts go, and what is no letter or digit becomes `_`. The
+    last part is the channel, r, g, b and a spelt out; the others are its layer, where `Ci` is
+    the main picture's.
+    """
+    parts = [re.sub(r"^[0-9]+", "", part) for part in channel.split(".", 2)]
+    *layers, last = [re.sub("[^a-zA-Z0-9]", "_", part) for part in parts if part] or ["unnamed"]
+    for word in ("red", "green", "blue", "alpha"):
+        if last in (word[0], word[0].upper(), word.title(), word.upper()):
+            last = word
+    layer = "_".join(layers)
+    return last if layer in ("", "Ci") else f"{layer}.{last}"
+
+
+@pytest.mark.parametrize(
+    ("channel", "name"),
+    [  # Printed by that source, compiled.
+        ("R", "red"),
+        ("2.0a.B", "a.blue"),
+        ("Ci.g", "green"),
+        ("View Layer.AO pass.r.x", "View_Layer_AO_pass.r_x"),
+        ("left..ALPHA", "left.alpha"),
+        (".", "unnamed"),
+        ("a.bLue", "a.bLue"),
+        ("7.8", "unnamed"),
+    ],
+)
+def test_the_rule_of_nuke(channel, name):
+    assert nuke_name(channel) == name
+
+
+def test_nuke_finds_the_passes(file):
+    """Each under its name; its reader wants one data window, and all of it shown."""
+    header = OpenEXR.File(str(file[1]), header_only=True).header()
+    found = {nuke_name(channel.name) for channel in header["channels"]}
+    colors = ("color", "ambient", "diffuse", "specular")
+    named = {f"{name}.{word}" for name in colors for word in ("red", "green", "blue")}
+    vector = {"normal.X", "normal.Y", "normal.Z"}
+    # Nuke keeps `depth.Z` for depth itself.
+    assert found == named | vector | {"depth.Z", "shader.V", "roughness.V"}
+    np.testing.assert_array_equal(header["dataWindow"], header["displayWindow"])
+    assert header["type"] == OpenEXR.scanlineimage and header["pixelAspectRatio"] == 1.0
 
 
 def layers_of(buffer):
