@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 
 from jaxfx import FocusPlanes, ThinLens, dof
 
@@ -98,18 +99,19 @@ def test_kernels_agree(seed, gamma, epsilon, coc):
 def test_a_point_of_light_keeps_its_energy_and_place(radius):
     # All pixels are blurred alike, so the weights sum to 1 away from the frame and the picture
     # of a point is its sprite.
-    side = 2 * math.ceil(radius) + 5
+    largest = next(each for each in (8, 20, 40) if radius <= each)
+    side = 2 * largest + 5
     size = 2 * side + 1
     image = jnp.zeros((size, size, 1)).at[side, side].set(1.0)
     depth = jnp.full((size, size), jnp.inf)
     lens = ThinLens(1.0, 1.0, 2 * radius) if radius else ThinLens(0.0, 1.0, 1.0)
-    spread = np.asarray(dof.scatter(image, depth, lens, kernel="shift"))[..., 0]
+    blur = lambda image: dof.scatter(image, depth, lens, max_coc=2 * largest, kernel="shift")
+    spread = np.asarray(blur(image))[..., 0]
     offset = np.arange(size) - side
     # Where nothing is cut by the frame, the weights are those of a full disc.
     middle = slice(side - math.ceil(radius) - 1, side + math.ceil(radius) + 2)
     assert spread[middle, middle].sum() == pytest.approx(spread.sum(), abs=1e-12)
-    frame = np.asarray(dof.scatter(jnp.ones((size, size, 1)), depth, lens, kernel="shift"))
-    np.testing.assert_allclose(frame, 1, atol=1e-12)
+    np.testing.assert_allclose(blur(jnp.ones((size, size, 1))), 1, atol=1e-12)
     assert spread.sum() == pytest.approx(1, abs=1e-5)
     assert abs((spread * offset).sum()) < 1e-3
     assert abs((spread * offset[:, None]).sum()) < 1e-3
@@ -173,7 +175,8 @@ def test_constant_linear_and_mirrored(seed, gamma, epsilon):
 def test_any_size(shape, kernel):
     image, depth = random_scene(5, *shape)
     lens = ThinLens(0.1, 2.5, 200.0)
-    result = dof.scatter(image, depth, lens, kernel=kernel)
+    blur = lambda *data: dof.scatter(*data, lens, max_coc=13, kernel=kernel)
+    result = quick_jit(blur)(image, depth)
     np.testing.assert_allclose(
         result, dof.scatter(image, depth, lens, kernel="segment_sum"), atol=1e-12
     )
@@ -185,9 +188,9 @@ def test_a_bad_pixel_spoils_what_it_can_reach_and_no_more(kernel):
     image, depth = random_scene(6, 31, 31)
     depth = jnp.full_like(depth, 5.0)
     lens = ThinLens(0.1, 2.5, 200.0)  # C = 4, so two pixels and a half
-    good = dof.scatter(image, depth, lens, max_coc=8, kernel=kernel)
     rows, columns = np.mgrid[:31, :31] - 15
     blur = jax.jit(lambda i, d: dof.scatter(i, d, lens, max_coc=8, kernel=kernel))
+    good = np.asarray(blur(image, depth))
     for bad in (jnp.nan, jnp.inf, -jnp.inf):
         result = blur(image.at[15, 15, 1].set(bad), depth)
         spoiled = np.isnan(result).all(axis=-1)
@@ -248,19 +251,28 @@ def picture(inputs, kernel, max_coc=8):
 
 
 @ft.cache
-def compiled(kernel):
-    """A scalar of the picture, its gradient, and its derivative along a direction."""
+def compiled(kernel, is_twice=False):
+    """One program: compiling is most of the work.
 
-    def loss(inputs):
-        blurred = picture(inputs, kernel)
-        weight = jnp.sin(jnp.arange(blurred.size, dtype=blurred.dtype) ** 2)
-        return jnp.sum(weight * blurred.ravel())
+    The picture; the gradient of a weighted sum of it; both their derivatives along a direction,
+    the gradient's only if that is asked for.
+    """
 
-    def derivatives(inputs, direction):
-        _, along = jax.jvp(loss, (inputs,), (direction,))
-        return *jax.value_and_grad(loss)(inputs), along
+    def gradient(inputs, weight):
+        blurred, pull = jax.vjp(lambda inputs: picture(inputs, kernel), inputs)
+        return blurred, *pull(weight)
 
-    return jax.jit(derivatives)  # one program: compiling is most of the work
+    def derivatives(inputs, direction, weight):
+        at, along = (inputs,), (direction,)
+        if is_twice:
+            return jax.jvp(lambda inputs: gradient(inputs, weight), at, along)
+        pushed = jax.jvp(lambda inputs: picture(inputs, kernel), at, along)[1]
+        return gradient(inputs, weight), (pushed, None)
+
+    return quick_jit(derivatives)
+
+
+SIGNS = jnp.asarray(np.sin(np.arange(9 * 11 * 3.0) ** 2).reshape(9, 11, 3))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -272,23 +284,23 @@ def test_gradients(kernel, name):
         np.random.default_rng(9).uniform(0.5, 1, np.shape(inputs[name])), float
     )
 
-    def moved(t):
-        return jax.tree.map(lambda x, dx: x + t * dx, inputs, direction)
+    def loss(t):
+        moved = jax.tree.map(lambda x, dx: x + t * dx, inputs, direction)
+        return np.vdot(SIGNS, compiled(kernel, True)(moved, direction, SIGNS)[0][0])
 
-    expected = differences(lambda t: compiled(kernel)(moved(t), direction)[0], 0.0)
+    expected = differences(loss, 0.0)
     assert abs(expected) > 1e-4
-    _, gradient, along = compiled(kernel)(inputs, direction)
-    np.testing.assert_allclose(along, expected, rtol=1e-6)
-    np.testing.assert_allclose(jnp.vdot(gradient[name], direction[name]), expected, rtol=1e-6)
+    (_, gradient), (pushed, _) = compiled(kernel, True)(inputs, direction, SIGNS)
+    np.testing.assert_allclose(np.vdot(SIGNS, pushed), expected, rtol=1e-6)
+    np.testing.assert_allclose(np.vdot(gradient[name], direction[name]), expected, rtol=1e-6)
 
 
 def test_gradients_with_one_tangent_only():
     inputs = inputs_of(8)
-    loss = lambda inputs: jnp.sum(picture(inputs, "tiles") ** 2)
-    _, pull = jax.vjp(loss, inputs)
-    (whole,) = pull(1.0)
+    (_, whole), _ = compiled("tiles", True)(inputs, inputs, SIGNS)
     for name in ("gamma", "image"):
-        alone = jax.jit(jax.grad(lambda x, n=name: loss(inputs | {n: x})))(inputs[name])
+        loss = lambda x, n=name: jnp.sum(SIGNS * picture(inputs | {n: x}, "tiles"))
+        alone = quick_jit(jax.grad(loss))(inputs[name])
         np.testing.assert_allclose(alone, whole[name], atol=1e-10)
 
 
@@ -296,23 +308,25 @@ def test_gradients_with_one_tangent_only():
 def test_gradient_at_a_silhouette(kernel):
     """Two flat-coloured planes, the near one before half of the far one: where path tracers'
     thin lenses return zero."""
-    image = jnp.concatenate([jnp.full((15, 8, 3), 0.9), jnp.full((15, 9, 3), 0.1)], axis=1)
-    depth = jnp.concatenate([jnp.full((15, 8), 1.6), jnp.full((15, 9), 4.1)], axis=1)
-    start = jnp.asarray([PARAMETERS["aperture"], PARAMETERS["focus_distance"]])
-
-    def edge(x):
-        inputs = PARAMETERS | {"image": image, "depth": depth}
-        inputs |= {"aperture": x[0], "focus_distance": x[1]}
-        inputs = {name: jnp.asarray(value) for name, value in inputs.items()}
-        return picture(inputs, kernel)[7, 5:12].mean(axis=-1)
-
-    derivatives = jax.jit(lambda x: (edge(x), jax.jacfwd(edge)(x), jax.jacrev(edge)(x)))
-    _, forward, reverse = derivatives(start)
-    for i, unit in enumerate(jnp.eye(2)):
-        expected = differences(lambda t, unit=unit: derivatives(start + t * unit)[0], 0.0)
+    names = ("aperture", "focus_distance")
+    near = np.broadcast_to(np.arange(11) < 5, (9, 11))
+    planes = {"image": np.where(near, 0.9, 0.1)[..., None] * np.ones(3)}
+    planes["depth"] = np.where(near, 1.6, 4.1)
+    inputs = jax.tree.map(lambda x: jnp.asarray(x, float), PARAMETERS | planes)
+    zero = jax.tree.map(jnp.zeros_like, inputs)
+    along = {name: zero | {name: jnp.ones(())} for name in names}
+    edge = lambda picture: np.asarray(picture)[4, 2:9].mean(axis=-1)
+    run = compiled(kernel, True)
+    for name in names:
+        moved = lambda t, n=name: edge(run(inputs | {n: inputs[n] + t}, along[n], SIGNS)[0][0])
+        expected = differences(moved, 0.0)
         assert np.abs(expected).max() > 1e-2
-        np.testing.assert_allclose(forward[:, i], expected, rtol=1e-3, atol=1e-7)
-    np.testing.assert_allclose(reverse, forward, atol=1e-10)
+        forward = edge(run(inputs, along[name], SIGNS)[1][0])
+        np.testing.assert_allclose(forward, expected, rtol=1e-3, atol=1e-7)
+        for k in range(7):
+            pixel = jnp.zeros((9, 11, 3)).at[4, 2 + k].set(1 / 3)
+            reverse = run(inputs, along[name], pixel)[0][1][name]
+            np.testing.assert_allclose(reverse, forward[k], atol=1e-10)
 
 
 DEGENERATE = {
@@ -337,27 +351,28 @@ def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
         else:
             inputs[name] = jnp.asarray(value, dtype)
     direction = jax.tree.map(jnp.ones_like, inputs)
-    for leaf in jax.tree.leaves(compiled(kernel)(inputs, direction)):
+    run = compiled(kernel, dtype == jnp.float64)
+    (blurred, gradient), (pushed, _) = run(inputs, direction, SIGNS.astype(dtype))
+    for leaf in jax.tree.leaves((blurred, gradient, pushed)):
         assert np.isfinite(leaf).all()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_second_derivatives(kernel):
-    inputs = inputs_of(13)
+    inputs, zero = inputs_of(13), jax.tree.map(jnp.zeros_like, inputs_of(13))
     names = ("aperture", "focus_distance", "gamma", "epsilon")
+    weight = SIGNS / SIGNS.size
+    select = lambda gradient: np.array([gradient[name] for name in names])
 
-    def loss(x):
-        given = inputs | dict(zip(names, x, strict=True))
-        return jnp.mean((picture(given, kernel) - inputs["image"]) ** 2)
+    def gradient(t, name):
+        moved = inputs | {name: inputs[name] + t}
+        return select(compiled(kernel, True)(moved, zero, weight)[0][1])
 
-    def gradient_twice(x):
-        gradient = jax.grad(loss)(x)
-        return gradient, gradient
-
-    x = jnp.stack([inputs[name] for name in names])
-    both = jax.jit(jax.jacfwd(gradient_twice, has_aux=True))
-    hessian, _ = both(x)
-    expected = [differences(lambda t, e=e: both(x + t * e)[1], 0.0) for e in jnp.eye(4)]
+    unit = lambda name: zero | {name: jnp.ones(())}
+    hessian = np.array(
+        [select(compiled(kernel, True)(inputs, unit(n), weight)[1][1]) for n in names]
+    )
+    expected = [differences(ft.partial(gradient, name=name), 0.0) for name in names]
     np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-10)
 
@@ -373,7 +388,12 @@ def test_half_images_keep_their_type():
 def test_focus_planes_are_a_lens():
     image, depth = random_scene(15)
     planes = FocusPlanes(1.0, 2.5, 8.0, 6.0)
-    results = [dof.scatter(image, depth, planes, gamma=1.0, kernel=k) for k in KERNELS]
+    blur = lambda kernel: (
+        lambda image, depth: dof.scatter(
+            image, depth, planes, gamma=1.0, max_coc=6, kernel=kernel
+        )
+    )
+    results = [quick_jit(blur(kernel))(image, depth) for kernel in KERNELS]
     np.testing.assert_allclose(results[0], results[1], atol=1e-12)
     assert np.abs(results[0] - image).max() > 0.1
 
