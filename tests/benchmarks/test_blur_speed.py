@@ -72,7 +72,7 @@ def test_one_pass_of_9_taps(benchmark, peer):
     benchmark.pedantic(function, rounds=31, warmup_rounds=3)
 
 
-@pytest.mark.parametrize(("peer", "calls"), [("OpenCV", 20), ("SciPy", 1)])
+@pytest.mark.parametrize(("peer", "calls"), [("OpenCV", 40), ("SciPy", 1)])
 def test_ratio(benchmark, peer, calls):
     """Ours and a peer's: the ratio of the medians, ours to theirs, is kept with the run."""
     benchmark.group = f"ours, in turns with {peer}, {calls} calls"

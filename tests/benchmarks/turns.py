@@ -8,21 +8,24 @@ import numpy as np
 def in_turns(benchmark, functions, *, rounds=15, calls=1):
     """The median time of each, in milliseconds: printed, and kept with the run.
 
-    A turn is of several calls where another's threads may still be spinning at its start. The
-    benchmark's own figure is the time of a whole round.
+    A turn is of several calls where another's threads still spin at its start: then only its
+    second half counts. (Twice the time at the first call after OpenCV, nothing after some ten.)
+    The benchmark's own figure is the time of a whole round.
     """
     times = {name: [] for name in functions}
 
     def one_round():
         for name, function in functions.items():
+            turn = []
             for _ in range(calls):
                 start = time.perf_counter()
                 function()
-                times[name].append(time.perf_counter() - start)
+                turn.append(time.perf_counter() - start)
+            times[name].append(turn[calls // 2 :])
 
     benchmark.pedantic(one_round, rounds=rounds, warmup_rounds=1)
     # Without the round that warms up.
-    milliseconds = {name: 1e3 * float(np.median(each[calls:])) for name, each in times.items()}
+    milliseconds = {name: 1e3 * float(np.median(each[1:])) for name, each in times.items()}
     benchmark.extra_info |= milliseconds
     print("\n" + ", ".join(f"{name}: {each:.2f} ms" for name, each in milliseconds.items()))
     return milliseconds
