@@ -9,19 +9,18 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import check, check_depth, check_image, clip01, parameter
 from jaxfx.dof._inputs import check_arguments, defocused
-from jaxfx.dof._sheets import Sheet, Sums, sums
+from jaxfx.dof._sheets import composited
 from jaxfx.dof._shift import shift
+from jaxfx.dof._slices import SLICES, Sheets
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
-# Two defocuses nearer than this, in pixels, are the same whatever the threshold.
-_SMALLEST_THRESHOLD = 1e-3
 _SMALLEST_GAP = 1e-3
+# Square of a slope, in pixels of defocus a pixel, that is as good as none.
+_LEVEL = 1e-2
 # A hidden point that this share of the lens sees counts in full.
 _SEEN = 0.25
-# Where less than this has arrived from behind, what lies behind is not known.
-_KNOWN = 1e-3
 
 
 def layered(
@@ -36,30 +35,28 @@ def layered(
 ) -> Float[Array, "height width channel"]:
     """Depth of field by point sprites that are composited at every pixel, without a gamma.
 
-    At each pixel q the sprites that arrive are sorted into those in front of the surface of q,
-    on it, and behind it. Each is weighted by the share of q's lens that sees it: its coverage
-    over its area, times `1 - (p - q) . grad log(defocus)`, for a surface whose defocus changes
-    turns towards one side of the lens. With F, S and B the three sums of weighted light and f,
-    s and b those of the weights, the result is
+    A sprite that arrives at a pixel stands for a share of the pixel's lens: its coverage over
+    its area, times `1 - (p - q) . grad log(defocus)`, for a surface whose defocus changes turns
+    towards one side of the lens. The shares of the surfaces that a lens sees add up to one. So
+    sprites fill it from the front: sorted into slices of defocus, `threshold` wide, each slice
+    takes what room is left, and what lies behind a full lens is hidden. Where the lens is not
+    filled, since what it sees there is in no picture, the mean of what has arrived stands for
+    the rest, each part of it weighted by 0.1 and what was filled when it arrived: what is not
+    seen lies rather behind.
 
-    `F over (S over B)`, of opacities `min(f, 1)` and `min(s / open, 1)`,
+    A slanted floor is thereby one surface, whatever slices it is cut into: their shares add up.
+    Slices are painted by spans, at a cost that grows with the radius, and its gradient's with
+    it.
 
-    with `open` the part of q's own disc that no surface in front of it hides, so that a surface
-    goes on behind what stands before it; B is normalized, for it does so too.
-
-    A sprite p is on the surface of q where the slopes of both explain the difference of their
-    defocus: `defocus_p - defocus_q` is clamped to what the trapezoid rule makes of them, and
-    what is left is another surface in full from `threshold` on. A slanted floor is thereby one
-    surface, however much its defocus changes.
-
-    With a second layer the same sums hold its sprites too. A point of it counts where the lens
-    sees past the first layer: in 8 directions the first layer is followed from the pixel as
-    long as it lies in front of the point, which gives the part of the lens that it covers.
+    With a second layer its sprites fill what the first leaves. A point of it counts where the
+    lens sees past the first layer: in 8 directions the first layer is followed from the pixel
+    as long as it lies in front of the point, which gives the part of the lens that it covers.
+    A point less than one slice behind is of the surface that hides it, and two behind it is of
+    another in full.
 
     What it does badly: what no layer shows is guessed from its surroundings, as is what lies
-    beyond the frame, where the last pixels are repeated. Of several surfaces in front of q, or
-    behind it, the mean is taken. A surface narrower than two pixels has no slope. The time
-    grows with the square of the radius, as that of `scatter(kernel="tiles")` does.
+    beyond the frame, where the last pixels are repeated. Within a slice nothing hides anything.
+    Two edges one before the other are taken to hide different parts of the lens.
 
     **Arguments:**
 
@@ -70,8 +67,8 @@ def layered(
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from `depth`.
     - `behind`: the image and depth of the next surface that faces the camera behind the first,
       shaped as `image` and `depth`; its depth is inf where there is none.
-    - `threshold`: pixels; how much two defocuses must differ, beyond what slopes explain, to be
-      of two surfaces. The default serves all scenes that we know.
+    - `threshold`: pixels; how much the defocus changes from slice to slice. The default serves
+      all scenes that we know. Below a 128th of `max_coc` it is that.
 
     **Returns:** height width channel, in the type of `image`. A pixel whose colour or depth is
     not a number spoils what its sprite can reach, `max_coc` where that is unknown.
@@ -80,9 +77,9 @@ def layered(
     a negative `threshold`, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
-    every field of `lens`, forward and reverse; zero where a sprite is clamped. At a kink (an
-    equal depth of neighbours, the ends of every clamp) one of the one-sided values; where
-    several meet, as at neighbours that all have one depth, it can lie beyond all of them.
+    every field of `lens`, forward and reverse; zero where a sprite is clamped. There is no kink
+    where neighbours have one depth or a surface is in focus. At the others, the ends of a
+    clamp and a lens that is just filled, each sprite and pixel has the value of one side.
 
     Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
     pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.
@@ -105,43 +102,54 @@ def layered(
 @ft.partial(jax.jit, static_argnames=("max_coc",))
 def _layered(image, depth, lens, max_coc, behind, threshold):
     view = defocused(image, depth, lens, max_coc)
-    threshold = jnp.maximum(threshold.astype(view.image.dtype), _SMALLEST_THRESHOLD)
-    defocus = view.defocus / threshold
-    everywhere = jnp.ones_like(defocus)
-    sheets = [_sheet(view.image, defocus, threshold, everywhere)]
+    threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
+    layers = [_sheet(view.image, view.defocus, jnp.ones_like(view.defocus), threshold)]
     spoiled = _spoiled(view.bad, depth, view.defocus, max_coc)
     if behind is not None:
         second = defocused(behind[0], behind[1], lens, max_coc)
         there = jnp.isfinite(behind[1]) & ~second.bad
-        farther = jnp.where(there, second.defocus / threshold, defocus)
-        seen = _seen(defocus * threshold, farther * threshold, max_coc)
-        through = jnp.where(there, clip01(seen / _SEEN), 0)
-        sheets.append(_sheet(second.image, farther, threshold, through))
+        farther = jnp.where(there, second.defocus, view.defocus)
+        seen = _seen(view.defocus, farther, max_coc)
+        # What lies within a slice behind a surface is that surface, folded.
+        apart = clip01((farther - view.defocus) / threshold - 1)
+        through = jnp.where(there, clip01(seen / _SEEN) * apart, 0)
+        layers.append(_sheet(second.image, farther, through, threshold))
         spoiled |= _spoiled(second.bad, behind[1], second.defocus, max_coc)
-    result = _composite(sums(reach(max_coc), sheets))
+    far = reach(max_coc)
+    # Beyond the frame all goes on as it ends there.
+    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
+    sheets = jax.tree.map(lambda *x: jnp.stack([pad(each) for each in x]), *layers)
+    light, late = jnp.split(jnp.moveaxis(composited(far, sheets), 0, -1), 2, axis=-1)
+    result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
     return jnp.where(spoiled[..., None], jnp.nan, result).astype(image.dtype)
 
 
 def _sheet(
     image: Float[Array, "height width channel"],
     defocus: Float[Array, "height width"],
-    threshold: Float[Array, ""],
     through: Float[Array, "height width"],
-) -> Sheet:
-    """The sprites of a layer whose defocus is given in thresholds."""
-    half = jnp.abs(defocus) * threshold / 2
+    threshold: Float[Array, ""],
+) -> Sheets:
+    """The sprites of a layer."""
+    half = jnp.abs(defocus) / 2
     radius = jnp.where(half < POINT_RADIUS, POINT_RADIUS, half)
-    slope = jnp.stack([_slope(defocus, 1), _slope(defocus, 0)])
-    signed = jnp.where(defocus < 0, -2, 2) * radius / threshold
+    signed = jnp.where(defocus < 0, -2, 2) * radius
+    tilt = jnp.stack([_slope(defocus, 1), _slope(defocus, 0)]) / signed[None]
+    # No weight turns negative within the disc.
+    square, most = (tilt * tilt).sum(axis=0), 1 / (radius + POINT_RADIUS)
+    steep = square > most * most
+    tilt = tilt * jnp.where(steep, most / jnp.sqrt(jnp.where(steep, square, 1)), 1)[None]
     value = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
     value = value * (through / (jnp.pi * radius * radius))[..., None]
-    return Sheet(
-        jnp.moveaxis(value, -1, 0), radius, through, defocus, slope, slope / signed[None]
-    )
+    return Sheets(jnp.moveaxis(value, -1, 0), radius, tilt, defocus / threshold)
 
 
 def _slope(x: Float[Array, "height width"], axis: int) -> Float[Array, "height width"]:
-    """The smaller of the differences to the neighbours on both sides, 0 where they disagree."""
+    """How much a surface's defocus changes a pixel, an edge of it left aside.
+
+    Of the differences to the neighbours on both sides, each weighted by the other's square: the
+    smaller counts where they differ much, and there is no kink where they are alike.
+    """
     if x.shape[axis] == 1:
         return jnp.zeros_like(x)
     step = jnp.diff(x, axis=axis)
@@ -150,8 +158,8 @@ def _slope(x: Float[Array, "height width"], axis: int) -> Float[Array, "height w
     )
     before = jnp.concatenate([first, step], axis=axis)
     after = jnp.concatenate([step, last], axis=axis)
-    smaller = jnp.where(jnp.abs(before) < jnp.abs(after), before, after)
-    return jnp.where((before > 0) == (after > 0), smaller, 0)
+    b, a = before * before + _LEVEL, after * after + _LEVEL
+    return (a * before + b * after) / (a + b)
 
 
 def _seen(
@@ -191,19 +199,6 @@ def _seen(
         return 1 - clip01(hidden) ** 2
 
     return jnp.mean(jax.lax.map(visible, jnp.asarray(ways)), axis=0)
-
-
-def _composite(sums: Sums) -> Float[Array, "height width channel"]:
-    """In front over (the same surface over what lies behind)."""
-    front, same, behind = (jnp.moveaxis(light, 0, -1) for light in sums.light)
-    f, s, b = front[..., -1:], same[..., -1:], behind[..., -1:]
-    share = s / sums.open[..., None]
-    share = jnp.where(share < 1, share, 1)
-    # What lies behind is taken to fill all that is left, unless next to nothing of it came.
-    rest = share * same / s + (1 - share) * behind / (b + _KNOWN)
-    rest = rest[..., :-1] / rest[..., -1:]
-    opaque = jnp.where(f > 1, f, 1)
-    return front[..., :-1] / opaque + (1 - f / opaque) * rest
 
 
 def _spoiled(

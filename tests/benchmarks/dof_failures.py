@@ -50,9 +50,8 @@ def _seen(method: str, name: str) -> Found:
 
 
 # What derivatives lack, against the truth and against the method's own difference quotients.
-TIES = "biased in depth at ties: one-sided values of several kinks, not all of one side"
 RIGHT_AND_BELOW = "biased at the focus: the slopes between pixels are those right and below"
-KINKS = {"layered": TIES, "gather": RIGHT_AND_BELOW}
+KINKS = {"gather": RIGHT_AND_BELOW}
 LEAKS = "biased: what leaks in moves with the lens"
 OUTLINE = "missing: the outline, cut out, does not move"
 ONE_LAYER = "biased: what the lens sees past the edge is not in the picture"
@@ -133,7 +132,6 @@ def radius_from_0_to_2(method):
     (*METHODS, "scatter, gamma 1", "scatter, gamma 3", *REFERENCE),
     dict.fromkeys((*METHODS, "scatter, gamma 1", "scatter, gamma 3"), ONE_LAYER)
     | dict.fromkeys(("anisotropic_diffusion", "implicit_diffusion"), OUTLINE)
-    | {"layered": f"{ONE_LAYER}; in depth, at ties, one-sided values of several kinks"}
     | REFERENCE,
 )
 def blurred_foreground(method):

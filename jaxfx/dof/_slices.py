@@ -1,0 +1,392 @@
+"""A slice of sprites, painted by spans block by block, and the adjoint of that.
+
+A slice is the sprites of about one defocus, so that all of them have about one radius. Blocks
+that hold none are passed over, and in the others a slice's sprites are gathered first.
+
+Where the defocus changes along a surface, its points crowd together as seen from one side of
+the lens and thin out from the other: a sprite's weight at an offset is `1 + tilt . offset`.
+Across rows the factor is that; along a row the span is moved by `tilt * half_width**2 / 3`,
+which keeps its sum and gives it the same centre.
+
+A running sum rounds what it carries: sprites that are large beside what a pixel sums to are
+painted tap by tap instead.
+
+What it does not do well: scattered writes use one core.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxfx._numerics import clip01
+from jaxfx.dof._paint import _add, _read
+from jaxfx.dof._spans import _too_bright
+from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
+from jaxfx.dof._tiles import inside
+
+
+# The steps of a block and of what its sprites reach fill half a megabyte at a radius of 32.
+BLOCK = (64, 64)
+# So many of a block's sprites are painted at a time, and so many of those that go by taps.
+CHUNK, BRIGHT_CHUNK = 1024, 16
+# At most so many slices lie to either side of the focus.
+SLICES = 128
+# How many slices later those of the next sheet are.
+APART = 2 * SLICES + 2
+
+
+class Sheets(NamedTuple):
+    """Layers of sprites that go on by `reach` pixels beyond the frame.
+
+    - `value`: the channels and a one, times the share that is let through, over the area.
+    - `radius`: pixels.
+    - `tilt`: the derivatives of the logarithm of the defocus along x and y, at most
+      `1 / (radius + 1/2)` together.
+    - `place`: the signed defocus, in slices, at most `SLICES`.
+    """
+
+    value: Float[Array, "sheet value height width"]
+    radius: Float[Array, "sheet height width"]
+    tilt: Float[Array, "sheet 2 height width"]
+    place: Float[Array, "sheet height width"]
+
+
+def ordered(place: Float[Array, "sheet height width"]) -> Float[Array, "sheet height width"]:
+    """The places of all sheets, one sheet after the other."""
+    return place + APART * jnp.arange(len(place), dtype=place.dtype)[:, None, None]
+
+
+def share_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The part of a sprite that belongs to a slice so many slices away: 1 at 0, 0 from 1 on.
+
+    Both of its slices together have all of it. It has no kink, where derivatives would be lost.
+    """
+    t = clip01(jnp.abs(beyond))
+    return 1 - t * t * (3 - 2 * t)
+
+
+def share_slope_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    t = clip01(jnp.abs(beyond))
+    return -6 * jnp.sign(beyond) * t * (1 - t)
+
+
+def _begun(
+    value: Float[Array, "disc value"],
+) -> tuple[Float[Array, "disc step"], Float[Array, "disc step"]]:
+    """What an end adds to the steps where a span begins, and what of a pixel that it cuts."""
+    nothing = jnp.zeros_like(value)
+    return jnp.concatenate([value, nothing], axis=1), jnp.concatenate([nothing, value], axis=1)
+
+
+def across_of(reach: int) -> int:
+    """How many pixels along a row a sprite reaches that a tilt has moved."""
+    return -(-4 * (2 * reach + 1) // 6) + 1
+
+
+class _End(NamedTuple):
+    """Where the spans of some discs begin (`side` -1) or end (1), in one row of each.
+
+    - `row`: its distance. `cell`: the window's cell that holds the end, after `cut` of it.
+    - `facing`: the factor of the row. `by_tilt`, `by_radius`: how the end moves with them.
+
+    A tap is an end that leaves the running sum alone, `whole` 0, and whose `cut` is its cover.
+    """
+
+    side: int
+    whole: int
+    row: Array
+    cut: Array
+    cell: Array
+    facing: Array
+    by_tilt: Array
+    by_radius: Any = 0
+
+
+class Grid:
+    """How sheets are divided into blocks, and where in a block's window its spans lie.
+
+    A window is a block and what its sprites can reach, and below it a row that nobody reads.
+    """
+
+    def __init__(self, reach: int, sheets: Sheets):
+        self.reach, self.across = reach, across_of(reach)
+        self.sheets, self.values, *padded = sheets.value.shape
+        self.height, self.width = (n - 2 * reach for n in padded)
+        self.padded = padded
+        counts = (max(1, round(n / side)) for n, side in zip(padded, BLOCK, strict=True))
+        self.blocks = down, across = tuple(counts)
+        self.block = tall, wide = -(-padded[0] // down), -(-padded[1] // across)
+        self.rows, self.columns = tall + 2 * reach, wide + 2 * self.across
+
+    def discs(
+        self, sheets: Sheets, dot: Sheets | None = None
+    ) -> Float[Array, "block disc plane"]:
+        """One row a disc: its value, radius, tilt, place, and whether it goes by taps.
+
+        The place of one that does not count is infinite. Given `dot`, the same of a tangent.
+        """
+        value, radius, tilt, place = dot or sheets
+        by_taps, fill = jnp.zeros_like(place), 0.0
+        if dot is None:
+            place = jnp.where(self._counts(sheets), ordered(place), jnp.inf)
+            by_taps = jax.vmap(_too_bright)(value, radius).astype(place.dtype)
+            fill = jnp.inf
+        planes = [value, radius[:, None], tilt, place[:, None], by_taps[:, None]]
+        planes = jnp.concatenate(planes, axis=1)
+        sides = [
+            (0, count * side - n)
+            for count, side, n in zip(self.blocks, self.block, planes.shape[2:], strict=True)
+        ]
+        planes = jnp.pad(planes, [(0, 0), (0, 0), *sides], constant_values=fill)
+        (down, across), (tall, wide) = self.blocks, self.block
+        planes = planes.reshape(self.sheets, -1, down, tall, across, wide)
+        return planes.transpose(0, 2, 4, 3, 5, 1).reshape(-1, tall * wide, planes.shape[1])
+
+    def planes(self, discs: Float[Array, "block disc plane"]) -> Sheets:
+        """The sheets that `discs` were made of."""
+        (down, across), (tall, wide) = self.blocks, self.block
+        planes = discs.reshape(self.sheets, down, across, tall, wide, -1)
+        planes = planes.transpose(0, 5, 1, 3, 2, 4)
+        planes = planes.reshape(self.sheets, -1, down * tall, across * wide)
+        height, width = self.padded
+        planes, v = planes[..., :height, :width], self.values
+        return Sheets(planes[:, :v], planes[:, v], planes[:, v + 1 : v + 3], planes[:, v + 3])
+
+    def _counts(self, sheets: Sheets) -> Bool[Array, "sheet height width"]:
+        """Which sprites are let through and reach the frame."""
+        far = [
+            jnp.maximum(
+                jnp.abs(jnp.arange(n, dtype=sheets.radius.dtype) - (n - 1) / 2)
+                - (n - 1) / 2
+                + self.reach,
+                0,
+            )
+            for n in self.padded
+        ]
+        rows, columns = far
+        reaches = rows[None, :, None] < sheets.radius + 0.5
+        reaches &= columns[None, None, :] < 4 / 3 * sheets.radius + 0.5
+        return reaches & (sheets.value[:, -1] > 0)
+
+    def each_slice(
+        self, discs: Float[Array, "block disc plane"], visit: Callable, carry: Any
+    ) -> Any:
+        """Fold `visit(index, blocks, count, carry)` over the slices from the front.
+
+        The first `count` of `blocks` hold sprites of the slice.
+        """
+        place = discs[..., self.values + 3]
+        there = jnp.isfinite(place)
+        low = jnp.where(there, place, jnp.inf).min()
+        high = jnp.where(there, place, -jnp.inf).max()
+
+        def add(index, carry):
+            held = (share_of(place - index.astype(place.dtype)) > 0).any(axis=1)
+            count = held.sum()
+            some = lambda carry: visit(index, jnp.argsort(~held), count, carry)
+            return jax.lax.cond(count > 0, some, lambda carry: carry, carry)
+
+        first, last = jnp.floor(low).astype(int), jnp.ceil(high).astype(int)
+        return jax.lax.fori_loop(first, last + 1, add, carry)
+
+    def paint(
+        self,
+        index: Int[Array, ""],
+        blocks: Int[Array, " block"],
+        count: Int[Array, ""],
+        discs: Float[Array, "block disc plane"],
+        dots: Float[Array, "block disc plane"] | None = None,
+    ) -> Float[Array, "value height width"]:
+        """The sum of a slice's sprites in the frame; with `dots`, then its derivative."""
+        v = self.values
+        channels = v if dots is None else 2 * v
+
+        def paint_chunk(steps, block, ids, share, share_slope, column):
+            disc = discs[block, ids]
+            shared = share[:, None]
+            value = disc[:, :v] * shared
+            whole, part = _begun(value)
+
+            def visit(steps, end):
+                step = end.whole * whole + end.cut[:, None] * part
+                step = (-end.side * end.facing)[:, None] * step
+                return _add(steps, end.cell[:, None], step)
+
+            def visit_dot(dot, whole_dot, part_dot, steps, end):
+                facing = (-end.side * end.facing)[:, None]
+                turned = -end.side * end.row * dot[:, v + 2]
+                moved = end.by_radius * dot[:, v] + end.by_tilt * dot[:, v + 1]
+                step = end.whole * whole + end.cut[:, None] * part
+                step_dot = end.whole * whole_dot + end.cut[:, None] * part_dot
+                step_dot = facing * (step_dot + moved[:, None] * part)
+                step_dot = step_dot + turned[:, None] * step
+                step = jnp.concatenate([facing * step, step_dot], axis=1)
+                return _add(steps, end.cell[:, None], step)
+
+            if dots is not None:
+                dot = dots[block, ids]
+                value_dot = dot[:, :v] * shared
+                value_dot = value_dot + disc[:, :v] * (share_slope * dot[:, v + 3])[:, None]
+                visit = ft.partial(visit_dot, dot, *_begun(value_dot))
+            slopes = dots is not None
+            return self._each_end(disc, ids, share, column, visit, steps, slopes=slopes)
+
+        def paint_block(n, canvas):
+            steps = jnp.zeros(((self.rows + 1) * self.columns, 2 * channels), discs.dtype)
+            steps = self._each_chunk(index, blocks[n], discs, paint_chunk, steps)
+            steps = steps.reshape(self.rows + 1, self.columns, -1, 2, v)[:-1]
+            painted = jax.lax.cumsum(steps[..., 0, :], axis=1) - steps[..., 1, :]
+            painted = painted.reshape(self.rows, self.columns, channels)
+            at = self._corner(blocks[n])
+            painted = jnp.moveaxis(painted, -1, 0)
+            there = jax.lax.dynamic_slice(canvas, at, painted.shape)
+            return jax.lax.dynamic_update_slice(canvas, there + painted, at)
+
+        canvas = jax.lax.fori_loop(0, count, paint_block, self._canvas(channels, discs.dtype))
+        y, x = 2 * self.reach, self.reach + self.across
+        return canvas[:, y : y + self.height, x : x + self.width]
+
+    def read_back(
+        self,
+        index: Int[Array, ""],
+        blocks: Int[Array, " block"],
+        count: Int[Array, ""],
+        discs: Float[Array, "block disc plane"],
+        bar: Float[Array, "value height width"],
+        bars: Float[Array, "block disc plane"],
+    ) -> Float[Array, "block disc plane"]:
+        """The adjoint of `paint` at `bar`, added to `bars`: steps read as they were written."""
+        v = self.values
+        canvas = self._canvas(v, discs.dtype)
+        at = (0, 2 * self.reach, self.reach + self.across)
+        canvas = jax.lax.dynamic_update_slice(canvas, bar, at)
+
+        def read_block(n, bars):
+            shape = v, self.rows, self.columns
+            seen = jax.lax.dynamic_slice(canvas, self._corner(blocks[n]), shape)
+            seen = jnp.moveaxis(seen, 0, -1)
+            ahead = jax.lax.cumsum(seen, axis=1, reverse=True)
+            steps = jnp.concatenate([ahead, seen], axis=-1)
+            steps = jnp.pad(steps, ((0, 1), (0, 0), (0, 0))).reshape(-1, 2 * v)
+
+            def read_chunk(bars, block, ids, share, share_slope, column):
+                disc = discs[block, ids]
+                value = disc[:, :v]
+
+                def visit(found, end):
+                    value_bar, radius_bar, *tilt_bar = found
+                    step = _read(steps, end.cell[:, None])
+                    ahead, here = step[:, :v], step[:, v:]
+                    arriving = -end.side * (end.whole * ahead - end.cut[:, None] * here)
+                    moving = end.side * end.facing * (value * here).sum(axis=1)
+                    return (
+                        value_bar + end.facing[:, None] * arriving,
+                        radius_bar + end.by_radius * moving,
+                        tilt_bar[0] + end.by_tilt * moving,
+                        tilt_bar[1] + end.row * (value * arriving).sum(axis=1),
+                    )
+
+                zero = jnp.zeros_like(share)
+                nothing = jnp.zeros_like(value), zero, zero, zero
+                value_bar, *rest = self._each_end(
+                    disc, ids, share, column, visit, nothing, slopes=True
+                )
+                place_bar = share_slope * (value * value_bar).sum(axis=1)
+                found = [value_bar * share[:, None]]
+                found += [x[:, None] for x in (*(x * share for x in rest), place_bar, zero)]
+                return bars.at[block, ids].add(jnp.concatenate(found, axis=1))
+
+            return self._each_chunk(index, blocks[n], discs, read_chunk, bars)
+
+        return jax.lax.fori_loop(0, count, read_block, bars)
+
+    def _canvas(self, channels: int, dtype: Any) -> Float[Array, "value rows columns"]:
+        (down, across), (tall, wide) = self.blocks, self.block
+        size = down * tall + 2 * self.reach, across * wide + 2 * self.across
+        return jnp.zeros((channels, *size), dtype)
+
+    def _corner(self, block: Int[Array, ""]) -> tuple[Any, ...]:
+        """Where the window of a block lies."""
+        (down, across), (tall, wide) = self.blocks, self.block
+        block = block % (down * across)
+        return 0, block // across * tall, block % across * wide
+
+    def _each_chunk(self, index, block, discs, visit, carry):
+        """Fold `visit(carry, block, discs, share, its slope, column)` over a slice's discs.
+
+        Bright discs come several times, for a `column` of taps each; for all others it is None.
+        """
+        beyond = discs[block, :, self.values + 3] - index.astype(discs.dtype)
+        bright = discs[block, :, self.values + 4] > 0
+        columns = jnp.arange(-self.across, self.across + 1)
+
+        def fold(carry, held, chunk, column):
+            size, taps = len(held), 1 if column is None else len(column)
+            at = jnp.where(held, jnp.cumsum(held) - 1, size + chunk)
+            ids = jnp.zeros(size + chunk, int).at[at].set(jnp.arange(size), mode="drop")
+            count = held.sum()
+
+            def each(n, carry):
+                mine = jax.lax.dynamic_slice_in_dim(ids, n * chunk, chunk)
+                there = jnp.repeat(n * chunk + jnp.arange(chunk) < count, taps)
+                mine = jnp.repeat(mine, taps)
+                away = beyond[mine]
+                of_slice, slope = (
+                    jnp.where(there, f(away), 0) for f in (share_of, share_slope_of)
+                )
+                tap = None if column is None else jnp.tile(column, chunk)
+                return visit(carry, block, mine, of_slice, slope, tap)
+
+            return jax.lax.fori_loop(0, -(-count // chunk), each, carry)
+
+        held = share_of(beyond) > 0
+        carry = fold(carry, held & ~bright, CHUNK, None)
+        return fold(carry, held & bright, BRIGHT_CHUNK, columns)
+
+    def _each_end(self, disc, ids, share, column, visit, carry, *, slopes):
+        """Fold `visit(carry, end)` over the ends of the discs' spans, or over their taps."""
+        v = self.values
+        radius, tilt_x, tilt_y = disc[:, v], disc[:, v + 1], disc[:, v + 2]
+        y = ids // self.block[1] + self.reach
+        x = (ids % self.block[1] + self.across).astype(disc.dtype) + 0.5
+        largest = jnp.where(share > 0, radius, 0).max()
+
+        def ends(width, slope):
+            by_tilt = width * width / 3
+            for side in (-1, 1):
+                end = x + tilt_x * by_tilt + side * width
+                cell = jnp.floor(end)
+                by_radius = [(side + tilt_x * width * (2 / 3)) * z for z in slope]
+                yield side, 1, end - cell, cell.astype(int), by_tilt, *by_radius
+
+        def tap(width, slope):
+            by_tilt = width * width / 3
+            middle = tilt_x * by_tilt + 0.5 - column.astype(disc.dtype)
+            start, end = middle - width, middle + width
+            moving = inside(end) - inside(start)
+            growing = inside(end) + inside(start) + moving * tilt_x * width * (2 / 3)
+            cover, cell = clip01(end) - clip01(start), x.astype(int) + column
+            yield 1, 0, cover, cell, moving * by_tilt, *(growing * z for z in slope)
+
+        def add_row(row, state):
+            carry, lower = state
+            height = row.astype(disc.dtype)
+            upper = segment_integral(radius, height + 0.5, slopes)
+            width, *slope = (a - b for a, b in zip(upper, lower, strict=True))
+            for side, whole, cut, cell, *by in (ends if column is None else tap)(width, slope):
+                for way in (1, -1):
+                    # The middle row is its own mirror image.
+                    there = y + row if way > 0 else jnp.where(row > 0, y - row, self.rows)
+                    cells = there * self.columns + cell
+                    facing = 1 + (way * height) * tilt_y
+                    end = _End(side, whole, way * height, cut, cells, facing, *by)
+                    carry = visit(carry, end)
+            return carry, upper
+
+        lower = [-z for z in segment_integral(radius, jnp.asarray(0.5, disc.dtype), slopes)]
+        rows = jnp.ceil(largest - POINT_RADIUS).astype(int) + 1
+        return jax.lax.fori_loop(0, rows, add_row, (carry, lower))[0]
