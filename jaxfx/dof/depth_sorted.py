@@ -16,8 +16,9 @@ from jaxfx.dof._tiles import tiles
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
-# Where "shift" adds fewer taps than this, it compiles sooner than "tiles".
-_FEW_TAPS = 2**23
+# Where "shift" adds fewer taps than this, it compiles sooner than "tiles", by half a second: as
+# much as forty calls take longer.
+_FEW_TAPS = 2**20
 # Coverage below this is none.
 _LEAST = 1e-12
 
