@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import relight_scenes
+from quick import quick_jit
 
 from jaxfx import (
     AmbientLight,
@@ -221,18 +222,22 @@ def test_derivatives_in_the_edited_light_are_those_of_shading_it(make):
     shadow = jnp.asarray(np.random.default_rng(6).uniform(0, 1, SIZE))
     along = jax.tree.map(jnp.cos, (light, shadow))
     state = relight.start(GBUFFER, CAMERA, [old, *make_lights(3)])
-    edited = jax.jit(lambda light, shadow: state.edit(0, light, shadow).image)
-    shaded = jax.jit(lambda light, shadow: relight.shade(GBUFFER, CAMERA, light, shadow))
-    _, pushed = jax.jvp(edited, (light, shadow), along)
-    _, expected = jax.jvp(shaded, (light, shadow), along)
-    np.testing.assert_allclose(pushed, expected, rtol=1e-9, atol=1e-12)
-    weight = jnp.sin(expected * 100)
-    pulled = jax.vjp(edited, light, shadow)[1](weight)
-    for one, other in zip(
-        jax.tree.leaves(pulled),
-        jax.tree.leaves(jax.vjp(shaded, light, shadow)[1](weight)),
-        strict=True,
-    ):
+    edited = lambda light, shadow: state.edit(0, light, shadow).image
+    shaded = lambda light, shadow: relight.shade(GBUFFER, CAMERA, light, shadow)
+
+    @quick_jit
+    def derivatives(light, shadow):
+        pushed, expected = (
+            jax.jvp(image, (light, shadow), along)[1] for image in (edited, shaded)
+        )
+        weight = jnp.sin(expected * 100)
+        pulled, wanted = (
+            jax.vjp(image, light, shadow)[1](weight) for image in (edited, shaded)
+        )
+        return (pushed, pulled), (expected, wanted)
+
+    found, expected = derivatives(light, shadow)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
@@ -252,7 +257,7 @@ def test_derivatives_in_the_cache_are_those_of_render():
     def rendered(floats):
         return jnp.sum(jnp.sin(relight.render(eqx.combine(floats, others), CAMERA, lights)))
 
-    one, other = jax.jit(jax.grad(edited))(floats), jax.jit(jax.grad(rendered))(floats)
+    one, other = (quick_jit(jax.grad(image))(floats) for image in (edited, rendered))
     for name in ("ambient", "diffuse", "specular", "normal", "depth", "roughness"):
         np.testing.assert_allclose(
             getattr(one, name), getattr(other, name), rtol=1e-8, atol=1e-10
@@ -260,7 +265,7 @@ def test_derivatives_in_the_cache_are_those_of_render():
     assert state.image.shape == (*SIZE, 3)
 
 
-@jax.jit
+@quick_jit
 def both_modes(floats, others, light):
     def loss(floats, light):
         state = relight.start(eqx.combine(floats, others), CAMERA, [light])
@@ -351,12 +356,17 @@ def test_painting_reflectances_shades_no_light():
 def test_derivatives_of_paint():
     state = relight.start(GBUFFER, CAMERA, make_lights(3))
     new = {"color": NEW, "diffuse": NEW[::-1], "specular": NEW, "roughness": np.array(0.6)}
-    loss = jax.jit(lambda new: jnp.sum(jnp.sin(state.paint(MASK, **new).image)))
+    loss = lambda new: jnp.sum(jnp.sin(state.paint(MASK, **new).image))
     along = {name: np.cos(value) for name, value in new.items()}
-    _, pushed = jax.jvp(loss, (jax.tree.map(jnp.asarray, new),), (along,))
-    moved = lambda step: loss({name: new[name] + step * along[name] for name in new})
+
+    @quick_jit
+    def derivatives(new):
+        value, pushed = jax.jvp(loss, (new,), (along,))
+        return value, pushed, jax.grad(loss)(new)
+
+    moved = lambda step: derivatives({k: jnp.asarray(new[k] + step * along[k]) for k in new})[0]
+    _, pushed, gradient = derivatives(jax.tree.map(jnp.asarray, new))
     assert float(pushed) == pytest.approx(float(moved(1e-6) - moved(-1e-6)) / 2e-6, rel=1e-6)
-    gradient = jax.grad(loss)(jax.tree.map(jnp.asarray, new))
     total = sum(np.vdot(gradient[name], along[name]) for name in new)
     assert float(pushed) == pytest.approx(total, rel=1e-9)
 

@@ -1,7 +1,6 @@
 """New views against a plain loop and against fresh caches. (Where two surfaces might blend:
 `tests/stability`.)"""
 
-import functools
 import inspect
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 from relight_views import (
     BLUE,
     CAMERAS,
@@ -27,8 +27,6 @@ from relight_views import (
 
 from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
 
-
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 FLOATS = ("color", "ambient", "diffuse", "specular", "roughness", "normal")
 
