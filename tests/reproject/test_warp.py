@@ -1,6 +1,5 @@
 """Pictures from other cameras, against cameras, planes and meshes whose view is known."""
 
-import functools
 import inspect
 import re
 
@@ -9,13 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reproject_cases as cases
+from quick import quick_jit
 
 from jaxfx import OrthographicCamera, PinholeCamera, scene
 from jaxfx.reproject import warp
-
-
-# Compiling is most of the work.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
@@ -31,25 +27,18 @@ def picture(height=24, width=32):
     return np.stack([np.sin(7 * x + y), np.cos(5 * y - x), x * y], axis=-1) + 1.5
 
 
-@pytest.mark.parametrize(
-    ("method", "dtype"),
-    [
-        ("pyramid", np.float32),
-        ("pyramid", np.float64),
-        ("descent", np.float32),
-        ("linear", np.float32),
-    ],
-)
-def test_the_same_camera_gives_the_same_picture(method, dtype):
+@pytest.mark.parametrize("method", ["descent", "linear"])
+def test_the_same_camera_gives_the_same_picture(method):
+    """In float32. That of "pyramid", in both types, is asked in `tests/stability`."""
     rng = np.random.default_rng(0)
-    image = rng.random((24, 32, 3)).astype(dtype)
-    depth = rng.uniform(1, 9, (24, 32)).astype(dtype)
+    image = rng.random((24, 32, 3)).astype(np.float32)
+    depth = rng.uniform(1, 9, (24, 32)).astype(np.float32)
     depth[rng.random((24, 32)) < 0.2] = np.inf
     eye = camera(at=(3.1, -2.2, 0.7), turn=0.3)
     drawn, alpha = warp(image, depth, eye, eye, method=method)
     np.testing.assert_array_equal(drawn, image)
     np.testing.assert_array_equal(alpha, 1)
-    assert drawn.dtype == alpha.dtype == dtype
+    assert drawn.dtype == alpha.dtype == np.float32
 
 
 @pytest.mark.parametrize("move", [(0.3, 0.1, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5)])
@@ -63,6 +52,7 @@ def test_a_plane_moves_by_its_homography(move):
     expected = np.asarray(source.project(points)[0])
     inside = ((expected > 0) & (expected < (32, 24))).all(axis=-1)
     np.testing.assert_array_equal(alpha > 0, inside)
+    assert drawn.dtype == alpha.dtype == np.float64
     inner = ((expected > 0.5) & (expected < (31.5, 23.5))).all(axis=-1)
     np.testing.assert_allclose(drawn[inner], expected[inner], atol=1e-9)
     assert not np.asarray(drawn)[~np.asarray(inside)].any()
@@ -220,10 +210,11 @@ def test_under_vmap_and_in_any_shape():
         target = PinholeCamera(camera(5, 7).intrinsics, pose)
         return warp(image, depth, camera(), target, shape=(5, 7))
 
-    images, alphas = jax.vmap(drawn)(moves)
+    images, alphas = quick_jit(jax.vmap(drawn))(moves)
     assert images.shape == (2, 5, 7, 3) and alphas.shape == (2, 5, 7)
+    single = quick_jit(drawn)
     for move, image_, alpha in zip(moves, images, alphas, strict=True):
-        one, mask = drawn(move)
+        one, mask = single(move)
         np.testing.assert_allclose(image_, one, atol=1e-12)
         np.testing.assert_array_equal(alpha, mask)
 

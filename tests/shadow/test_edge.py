@@ -1,4 +1,7 @@
-"""Filtering only where it matters: which pixels, at what cost, and what is lost."""
+"""Filtering only where it matters: which pixels, at what cost, and what is lost.
+
+That masking by depth changes no bit of any size of filter is asked in `tests/stability`.
+"""
 
 import functools as ft
 import inspect
@@ -7,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 from shadow_scenes import plate
 
 from jaxfx import shadow
@@ -26,20 +30,6 @@ def steps_case(seed, dtype=np.float32):
     z = rng.choice([-1.0, 1.0, 1.5, 2.0, 2.5, np.nan, np.inf], (40, 50))
     fields = (u, v, z, rng.uniform(0, 0.2, (40, 50)))
     return shadow_map.astype(dtype), shadow.Receivers(*(jnp.asarray(f, dtype) for f in fields))
-
-
-SIZES = [(size, np.float32) for size in (1, 3, 7, 15, 31)] + [(5, np.float64)]
-
-
-@pytest.mark.parametrize(("size", "dtype"), SIZES)
-def test_depth_mask_is_pcf_to_the_last_bit(size, dtype):
-    cases = [steps_case(seed, dtype) for seed in (0, 1)]
-    cases += [random_case(seed, (64, 80), (40, 50), dtype) for seed in (2, 3)]
-    for case in cases:
-        for slope_bias in (0.0, 0.7):
-            options = {"size": size, "bias": 0.013, "slope_bias": slope_bias}
-            visible = shadow.edge_pcf(*case, mask="depth", **options)
-            np.testing.assert_array_equal(visible, shadow.pcf(*case, **options))
 
 
 @pytest.mark.parametrize(
@@ -182,7 +172,7 @@ def test_derivatives_are_pcfs():
     at = (jnp.asarray(shadow_map), jnp.asarray(receivers.z), 0.05, 0.3)
     exact = ft.partial(shadow.edge_pcf, mask="depth")
     found, expected = (
-        jax.jit(jax.grad(ft.partial(loss, function), argnums=(0, 1, 2, 3)))(*at)
+        quick_jit(jax.grad(ft.partial(loss, function), argnums=(0, 1, 2, 3)))(*at)
         for function in (exact, shadow.pcf)
     )
     for one, other in zip(found, expected, strict=True):

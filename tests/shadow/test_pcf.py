@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 
 from jaxfx import shadow
 
@@ -155,17 +156,16 @@ def test_gradients_of_soft_forms(case, kernel):
     shadow_map, receivers = case
     weight = np.random.default_rng(5).normal(size=receivers.z.shape)
 
-    @jax.jit
     def loss(shadow_map, receivers, bias, slope_bias, softness):
         options = {"bias": bias, "slope_bias": slope_bias, "softness": softness}
         return jnp.sum(
             weight * shadow.pcf(shadow_map, receivers, size=3, kernel=kernel, **options)
         )
 
-    grad = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3, 4)))
+    both = quick_jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3, 4)))
     for softness in (0.03, 1.0):
         at = jax.tree.map(jnp.asarray, (shadow_map, receivers, 0.05, 0.4, softness))
-        check_along_random_directions(loss, at, grad(*at))
+        check_along_random_directions(lambda *at: both(*at)[0], at, both(*at)[1])
 
 
 def check_along_random_directions(loss, at, slopes):
@@ -195,5 +195,5 @@ def test_hard_forms_have_zero_gradients(case):
             return jnp.sum(function(shadow_map, receivers, bias=bias, slope_bias=bias))
 
         arguments = jax.tree.map(jnp.asarray, (*case, 0.1))
-        for leaf in jax.tree.leaves(jax.grad(loss, argnums=(0, 1, 2))(*arguments)):
+        for leaf in jax.tree.leaves(quick_jit(jax.grad(loss, argnums=(0, 1, 2)))(*arguments)):
             np.testing.assert_array_equal(leaf, 0)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 
 from jaxfx import OrthographicCamera, PinholeCamera, shadow
 from jaxfx._sampling import pixel_centers
@@ -141,7 +142,7 @@ def test_points_beside_and_behind_the_light_have_finite_gradients():
     found = shadow.receivers(depth, camera, light)
     np.testing.assert_array_equal(found.z[2:], -1)
     assert (np.asarray(found.z[:2]) > 0).all()
-    for leaf in jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1)))(depth, light)):
+    for leaf in jax.tree.leaves(quick_jit(jax.grad(loss, argnums=(0, 1)))(depth, light)):
         assert np.isfinite(leaf).all()
 
 
@@ -168,7 +169,7 @@ def test_derivatives_reach_depth_and_light_through_every_soft_form(form):
         return jnp.sum(form(shadow_map, seen, light, size=3, bias=0.1, slope_bias=0.1) ** 2)
 
     at = jnp.asarray(rng.uniform(2, 4, (HEIGHT, WIDTH))), spot_camera()
-    program = jax.jit(lambda at, along: jax.jvp(total, at, along))
+    program = quick_jit(lambda at, along: jax.jvp(total, at, along))
     zeros = jax.tree.map(jnp.zeros_like, at)
     for index, value in enumerate(at):
         some = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), value)

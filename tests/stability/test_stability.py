@@ -25,12 +25,16 @@ for effect in stability.EFFECTS:
 # What no method may get wrong, whatever else it gets wrong.
 NEVER = {
     "dof": ("constant image", "float32", "float64", "energy", "not finite"),
+    "blur": ("inside", "change", "gradient", "other channels"),
+    "reproject": ("image", "alpha"),
+    "shadow": ("pixels",),
 }
 
 
 def limit(bound, published):
-    """A figure that passes may vary within its bound; another by a fiftieth, or rounding."""
-    return max(0.0 if bound is None else bound, 1.02 * published, 1e-9)
+    """A figure that passes may vary within its bound, none if that is 0; another by a fiftieth,
+    or rounding."""
+    return max(1.02 * published, 1e-9 if bound is None else bound)
 
 
 @pytest.mark.parametrize("group", GROUPS)
@@ -96,12 +100,3 @@ def test_a_thumbnail_has_one_pixel_for_each_of_a_small_picture():
     assert (tile[9:12, 15:18] == 255).all() and (tile[:9, :15] == 0).all()
     assert (tile[33:36, 45:48] == (204, 26, 26)).all()
     assert (tile[36:] == 255).all()
-
-
-def test_acne_falls_and_leaks_grow_with_both_biases():
-    found = stability.published("shadow")["bias and slope"]
-    figures = [[figure[name] for figure in found.values()] for name in ("acne", "leaks")]
-    acne, leaks = np.reshape(figures, (2, 4, 3))
-    for axis in (0, 1):
-        assert (np.diff(acne, axis=axis) <= 0).all()
-        assert (np.diff(leaks, axis=axis) >= 0).all()
