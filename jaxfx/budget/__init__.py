@@ -1,8 +1,8 @@
 """The cheapest settings of an effect within an error: model no more than a scene needs.
 
-A plan has its price. On a picture of 512 x 384 it takes 2 to 16 seconds to find, nearly all of
-them to compile what is tried; once that is compiled, the time of 7 to 33 renderings at full
-quality. It pays where a scene is drawn again and again: with other lights, in a loop that fits.
+A plan has its price: the time of about three renderings at full quality, of which one is the
+proof, and, at first, seconds to compile what is tried. It pays where a scene is drawn again and
+again: with other lights, in a loop that fits.
 """
 
 from jaxfx.budget._plan import Plan

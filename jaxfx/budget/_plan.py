@@ -1,6 +1,7 @@
 """What a plan is, and how one is chosen: by trying it on the scene that it is for."""
 
-import statistics
+import functools
+import math
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple, final
@@ -8,13 +9,19 @@ from typing import Any, NamedTuple, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx._numerics import is_concrete
 
 
-# Calls after the first of which the median time is taken, fewer if they take so many seconds.
-_CALLS, _ENOUGH = 3, 0.5
+# How far a way may err on parts of a scene to be measured on all of it: first the quickest that
+# may be within the error there, then, if it is not, one that has more room.
+_ROOMS = (1.25, 1.0, 0.75)
+# A way that takes so many times as long as the effect is not drawn on further parts.
+_SLOW = 1.5
+# The programs that were called before, and so are compiled.
+_called: set[int] = set()
 
 
 @final
@@ -49,62 +56,86 @@ class Plan(eqx.Module):
         return "\n".join([*lines, *(f"- {sentence}" for sentence in self.left_out)])
 
 
+class Part(NamedTuple):
+    """A part of a scene, a small scene of its own, and the share that it stands for."""
+
+    data: Sequence[Any]
+    share: float = 1.0
+
+
 class Trial(NamedTuple):
-    """A way to make the picture, tried: what it leaves out, its error and its time."""
+    """A way to make the picture, and how it went part by part, until it was dropped.
+
+    `squares` are the squared errors, times the parts' shares; `time` is in the effect's.
+    """
 
     call: Any
     left_out: str
-    error: float
-    seconds: float
+    squares: tuple[float, ...]
+    time: float
 
-
-class Part(NamedTuple):
-    """The data of a part of a scene, and what of its picture is looked at."""
-
-    data: Sequence[Any]
-    core: tuple[slice, ...] = ()
+    @property
+    def error(self) -> float:
+        """At least this."""
+        return math.sqrt(sum(self.squares))
 
 
 class Search:
-    """Ways to make an effect's picture, tried on some parts of a scene or on all of it.
+    """Ways to make an effect's picture, tried on parts of a scene, a few measured on all of it.
 
-    What the parts say decides which ways are measured on the whole scene, the quickest first.
-    The promise rests on that measurement alone.
+    The parts tell which ways are worth a measurement. The promise rests on that alone.
     """
 
     def __init__(
         self, effect: Any, data: Sequence[Any], max_error: float, parts: Sequence[Part] = ()
     ):
-        self.effect, self.max_error = effect, max_error
-        self.whole, self.parts = [Part(data)], parts or [Part(data)]
-        self.references, self.seconds = _drawn(effect, self.parts)
-        self.trials: list[Trial] = []
-        self._in_full = not parts
+        self.effect, self.data, self.max_error = effect, data, max_error
+        self.parts = [(part, *timed(effect, part.data)) for part in parts]
+        self.tried: list[Trial] = []
+        self.measured: list[Trial] = []
+
+    @functools.cached_property
+    def whole(self) -> tuple[Part, Any, float]:
+        """All of the scene, what the effect makes of it, and its seconds."""
+        return Part(self.data), *timed(self.effect, self.data)
 
     def trial(self, call: Any, left_out: str) -> Trial:
-        """A way, tried on the parts."""
-        self.trials.append(_tried(call, left_out, self.parts, self.references))
-        return self.trials[-1]
+        """A way, tried on the parts up to where it is too far off or slow; or else measured."""
+        if not self.parts:
+            return self.measure(call, left_out)
+        most = _ROOMS[0] * self.max_error
+        self.tried.append(_compared(call, left_out, self.parts, most))
+        return self.tried[-1]
+
+    def measure(self, call: Any, left_out: str) -> Trial:
+        """A way, measured on the whole scene."""
+        self.measured.append(_compared(call, left_out, [self.whole]))
+        return self.measured[-1]
 
     def plan(self) -> Plan:
-        """The quickest way that is within the error on the whole scene: or else the effect."""
-        within = [n for n, trial in enumerate(self.trials) if trial.error <= self.max_error]
-        references, full = self.references, self.seconds
-        if within and not self._in_full:
-            references, full = _drawn(self.effect, self.whole)
-        best, chosen = Trial(self.effect, "", 0.0, full), -1
-        for n in sorted(within, key=lambda n: self.trials[n].seconds):
-            if not self._in_full:
-                self.trials[n] = _tried(*self.trials[n][:2], self.whole, references)
-            if self.trials[n].error <= self.max_error and self.trials[n].seconds < full:
-                best, chosen = self.trials[n], n
-                break
+        """The quickest way that is within the error on the whole scene, or else the effect."""
+        for room in _ROOMS:
+            might = [trial for trial in self.tried if self._is_better(trial, room)]
+            if might:
+                quickest = min(might, key=lambda trial: trial.time)
+                self.tried = [trial for trial in self.tried if trial is not quickest]
+                if self._is_better(self.measure(*quickest[:2])):
+                    break
+        full = self.whole[2]
+        kept = filter(self._is_better, self.measured)
+        itself = Trial(self.effect, "", (), 1.0)
+        best = min(kept, key=lambda trial: trial.time, default=itself)
         sentences = [f"{best.left_out}."] if best.left_out else []
-        for trial in (trial for n, trial in enumerate(self.trials) if n != chosen):
-            too_far = trial.error > self.max_error
-            error, time = f"errs by {trial.error:.2g}", f"takes {1e3 * trial.seconds:.3g} ms"
-            sentences.append(f"not taken: {trial.left_out}: {error if too_far else time}.")
-        return plan(best.call, best.error, best.seconds, full, sentences)
+        for trials, where in ((self.measured, ""), (self.tried, " on parts")):
+            for trial in (trial for trial in trials if trial is not best):
+                why = f"takes {trial.time:.2g} of the effect's time{where}"
+                if trial.error > self.max_error:
+                    why = f"errs by {trial.error:.2g}{where}"
+                sentences.append(f"not taken: {trial.left_out}: {why}.")
+        return plan(best.call, best.error, best.time * full, full, sentences)
+
+    def _is_better(self, trial: Trial, room: float = 1.0) -> bool:
+        return trial.error <= room * self.max_error and trial.time < 1
 
 
 def check_call(name: str, max_error: Any, data: Any) -> float:
@@ -122,20 +153,25 @@ def check_call(name: str, max_error: Any, data: Any) -> float:
 
 
 def timed(call: Any, data: Sequence[Any]) -> tuple[Any, float]:
-    """What a call gives, and the median seconds of a compiled one."""
-    result, times = jax.block_until_ready(call(*data)), []
-    while len(times) < _CALLS and sum(times) < _ENOUGH:
-        started = time.perf_counter()
+    """The picture that a call gives, and the seconds it takes once it is compiled."""
+    leaves, structure = jax.tree.flatten((call, data))
+    kinds = [(np.shape(leaf), getattr(leaf, "dtype", leaf)) for leaf in leaves]
+    program = hash((structure, *kinds))
+    if program not in _called:
         jax.block_until_ready(call(*data))
-        times.append(time.perf_counter() - started)
-    return result, statistics.median(times)
+        _called.add(program)
+    started = time.perf_counter()
+    result = jax.block_until_ready(call(*data))
+    seconds = time.perf_counter() - started
+    # Of a pair it is the picture, and not its coverage.
+    return result[0] if isinstance(result, tuple) else result, seconds
 
 
-def root_mean_square(difference: Float[Array, "..."]) -> float:
+@jax.jit
+def mean_square(difference: Float[Array, "..."]) -> Float[Array, ""]:
     """Of what is finite in both pictures; what is not is the same in both."""
-    finite = jnp.isfinite(difference)
-    squares = jnp.where(finite, difference, 0).astype(float) ** 2
-    return float(jnp.sqrt(jnp.sum(squares) / max(difference.size, 1)))
+    squares = jnp.where(jnp.isfinite(difference), difference, 0).astype(float) ** 2
+    return jnp.sum(squares) / max(difference.size, 1)
 
 
 def plan(
@@ -146,18 +182,15 @@ def plan(
     return Plan(call, *numbers, left_out=tuple(sentences))
 
 
-def _drawn(call: Any, parts: Sequence[Part]) -> tuple[list[Array], float]:
-    """The pictures of all parts, and the seconds that they take together."""
-    results = [timed(call, part.data) for part in parts]
-    # Of a pair it is the picture, and not its coverage.
-    first = lambda result: result[0] if isinstance(result, tuple) else result
-    pairs = zip(results, parts, strict=True)
-    pictures = [first(result)[part.core] for (result, _), part in pairs]
-    return pictures, sum(seconds for _, seconds in results)
-
-
-def _tried(call: Any, text: str, parts: Sequence[Part], references: list[Array]) -> Trial:
-    pictures, seconds = _drawn(call, parts)
-    pairs = zip(pictures, references, strict=True)
-    differences = [(picture - reference).reshape(-1) for picture, reference in pairs]
-    return Trial(call, text, root_mean_square(jnp.concatenate(differences)), seconds)
+def _compared(
+    call: Any, left_out: str, parts: Sequence[tuple[Part, Any, float]], most: float = math.inf
+) -> Trial:
+    """A way against the effect, part by part, until it errs by more than `most` or is slow."""
+    squares, seconds, of_effect = [], 0.0, 0.0
+    for part, reference, took in parts:
+        picture, own = timed(call, part.data)
+        squares.append(part.share * float(mean_square(picture - reference)))
+        seconds, of_effect = seconds + own, of_effect + took
+        if math.sqrt(sum(squares)) > most or seconds > _SLOW * of_effect:
+            break
+    return Trial(call, left_out, tuple(squares), seconds / of_effect)

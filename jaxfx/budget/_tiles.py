@@ -70,6 +70,18 @@ def sums(
     return np.stack([np.bincount(tile, level) for level in values], axis=1)
 
 
+def tile_sums(image: Float[Array, "height width channel"]) -> Float[Array, " tile"]:
+    """The sum over each tile and all channels."""
+    image = jnp.sum(image, axis=-1)
+    rows, columns = (-(-size // _SIDE) for size in image.shape)
+    room = [
+        (0, count * _SIDE - size)
+        for count, size in zip((rows, columns), image.shape, strict=True)
+    ]
+    tiles = jnp.pad(image, room).reshape(rows, _SIDE, columns, _SIDE)
+    return jnp.sum(tiles, axis=(1, 3)).ravel()
+
+
 def spend(
     squares: Float[np.ndarray, "tile level"], max_error: float, size: int
 ) -> Int[np.ndarray, " tile"]:

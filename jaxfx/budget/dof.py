@@ -1,11 +1,11 @@
 """Depth of field within an error."""
 
-import itertools
 import math
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
@@ -25,9 +25,9 @@ from jaxfx.lens import FocusPlanes, ThinLens
 _SPLITS = (8.0, 10.0)
 # Taps of gather, whose errors tell how many would do; more than so many are not tried.
 _FEW, _MORE, _MOST = 4, 16, 64
-# The parts that are tried: so many to a side, of so many pixels each way and what reaches them,
+# The parts that are tried: so many, of so many pixels a side or as wide as the largest circle,
 # if they are less than this share of the picture; or else all of it.
-_PARTS, _SIDE, _SHARE = 3, 64, 1 / 3
+_PARTS, _SIDE, _SHARE = 6, 64, 1 / 4
 
 
 def _nothing(image: Any, depth: Any, lens: Any) -> Any:
@@ -80,18 +80,19 @@ def dof(
     """The quickest depth of field within an error of `dof.scatter`.
 
     Where no circle of confusion passes its pixel, nothing is done, and nothing tried. Else the
-    effect and cheaper ways are drawn on nine parts of this scene, or on all of it where it is
-    small: the picture as it is; circles no larger than a power of two (the smallest that will
-    do is searched by halving); sprites wider than 8 or 10 pixels in octaves, the larger at the
-    lower resolution; scatter's other kernel; the separable filter, diffusion, blending; and
-    gather, by as many taps as its variance asks for: from the errors of two numbers of taps
-    follow the part that more taps can mend and the part that they can't. Of those within the
-    error the quickest is measured on the whole scene and, if its error holds there, taken; or
-    else the next, at the last the effect itself. The effect goes no farther in each tile than
-    the largest circle that reaches it.
+    effect and cheaper ways are drawn on six tiles of this scene, which stand for as many groups
+    of tiles that a blur changes alike, or on all of it where it is small: the picture as it is;
+    circles no larger than a power of two (the smallest that will do is searched by halving);
+    sprites wider than 8 or 10 pixels in octaves, the larger at the lower resolution; scatter's
+    other kernel; the separable filter, diffusion, blending, layers; and gather, by as many taps
+    as its variance asks for: from the errors of two numbers of taps follow the part that more
+    taps can mend and the part that they can't. A way is dropped at the tile at which it errs
+    too much or is too slow. Of the others the quickest is measured on the whole scene and, if
+    its error holds there, taken; or else one that errs less, at the last the effect itself. The
+    effect goes no farther in each tile than the largest circle that reaches it.
 
-    It costs a program for each way, of which compiling is most, and on a large picture two
-    renderings.
+    It costs one rendering for the proof, one by the plan (two or three if the tiles misled),
+    and about as much as another for the tiles; at first also a program for each way.
 
     **Arguments:**
 
@@ -121,73 +122,109 @@ def dof(
         return plan(Method("nothing"), 0.0, 0.0, float("nan"), [f"all, for {why}"])
 
     largest = largest_coc("dof", depth, lens)
-    effect = Method(target, max_coc=largest)
+    ways = _Ways(target, (depth.shape[0], depth.shape[1]), largest)
     data = (image, depth, lens)
-    search = Search(effect, data, max_error, _parts(data, math.ceil(largest / 2) + 1))
+    search = Search(ways.effect(largest), data, max_error, _parts(*data, largest))
     if search.trial(Method("nothing"), "all blur").error > max_error:
-        _smaller_circles(search, target, largest)
-        _other_methods(search, target, largest)
+        _smaller_circles(search, ways)
+        _other_methods(search, ways)
         _gathered(search, largest)
     return search.plan()
 
 
-def _parts(data: Any, margin: int) -> list[Part]:
-    """Parts of a scene with what reaches them; none if there are not much fewer pixels."""
-    image, depth, lens = data
-    side, size = _SIDE + 2 * margin, depth.shape
-    if side > min(size) or (_PARTS * side) ** 2 > _SHARE * size[0] * size[1]:
+class _Ways(NamedTuple):
+    """What all ways to make a picture have in common: the effect, the size, the circles."""
+
+    target: str
+    shape: tuple[int, int]
+    largest: float
+
+    def effect(self, max_coc: float) -> Method:
+        """The effect, with no circle larger; a part is drawn by the whole picture's kernel."""
+        if self.target == "layered":
+            return Method("layered", max_coc=max_coc)
+        return Method("scatter", max_coc=max_coc, kernel=cheapest(*self.shape, max_coc))
+
+
+def _parts(image: Any, depth: Any, lens: Any, largest: float) -> list[Part]:
+    """A few tiles of a scene; none if they are not much fewer pixels.
+
+    A blur matters by how much brightness changes, times how wide it is. Tiles in the order of
+    that are split into groups that have the same sum of it: the middle tile stands for its
+    group. What would reach a tile from outside is missing from its picture by the effect and by
+    every other way, whose error is much the same: all about it a tile would cost several.
+    """
+    side = max(_SIDE, math.ceil(largest))
+    rows, columns = (size // side for size in depth.shape)
+    if _PARTS * side**2 > _SHARE * depth.size:
         return []
-    core = (slice(margin, margin + _SIDE),) * 2
-    corners = [[(n - side) * i // (_PARTS - 1) for i in range(_PARTS)] for n in size]
-    windows = [
-        (slice(row, row + side), slice(column, column + side))
-        for row, column in itertools.product(*corners)
-    ]
-    return [Part((image[window], depth[window], lens), core) for window in windows]
+    bright = np.asarray(image).sum(axis=-1)
+    change = sum(np.abs(np.diff(bright, axis=axis, append=0)) for axis in (0, 1))
+    matters = np.nan_to_num(change * np.asarray(lens.circle_of_confusion(depth)))
+    matters = matters[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    matters = matters.sum(axis=(1, 3)).ravel() + 1e-9
+    order = np.argsort(-matters)
+    before = np.cumsum(matters[order]) - matters[order] / 2
+    group = (_PARTS * before / matters.sum()).astype(int)
+    parts = []
+    for number in np.unique(group):
+        members = order[group == number]
+        row, column = divmod(int(members[len(members) // 2]), columns)
+        window = tuple(slice(side * place, side * (place + 1)) for place in (row, column))
+        share = len(members) / len(order)
+        parts.append(Part((image[window], depth[window], lens), share))
+    return parts
 
 
-def _smaller_circles(search: Search, target: str, largest: float) -> None:
+def _smaller_circles(search: Search, ways: _Ways) -> None:
     """Try the effect with ever smaller circles, halving the ladder down to the least."""
-    sizes = [2.0**octave for octave in range(1, 12) if 2**octave < largest]
+    sizes = [2.0**octave for octave in range(1, 12) if 2**octave < ways.largest]
     low, high = 0, len(sizes)
     while low < high:
         middle = (low + high) // 2
         text = f"what circles of confusion have above {sizes[middle]:g} pixels"
-        error = search.trial(Method(target, max_coc=sizes[middle]), text).error
+        error = search.trial(ways.effect(sizes[middle]), text).error
         low, high = (low, middle) if error <= search.max_error else (middle + 1, high)
 
 
-def _other_methods(search: Search, target: str, largest: float) -> None:
+def _other_methods(search: Search, ways: _Ways) -> None:
     """Try what is not the effect, but may be near it."""
+    largest = ways.largest
     for split in _SPLITS:
         if split < largest:
             text = f"details of sprites wider than {split:g} pixels, at less resolution"
-            search.trial(Method("scatter in octaves", max_coc=largest, split=split), text)
+            octave = Method("scatter in octaves", max_coc=largest, split=split)
+            # The next is nearer to the effect, and slower.
+            if search.trial(octave, text).error <= search.max_error:
+                break
     for name in _OTHERS:
         search.trial(Method(name, max_coc=largest), f"exact discs, by {name}")
-    if target == "layered":
-        search.trial(Method("scatter", max_coc=largest), "what hides what, by scatter")
+    kernel = cheapest(*ways.shape, largest)
+    if ways.target == "layered":
+        exact = Method("scatter", max_coc=largest, kernel=kernel)
+        search.trial(exact, "what hides what, by scatter")
         return
-    height, width = search.whole[0].data[1].shape
-    if (kernel := cheapest(height, width, largest)) in _KERNELS:
-        text = f'the kernel "{kernel}", by "{_KERNELS[kernel]}"'
-        search.trial(Method("scatter", max_coc=largest, kernel=_KERNELS[kernel]), text)
+    search.trial(Method("layered", max_coc=largest), "the sums of all discs, by layered")
+    if kernel in _KERNELS:
+        other = Method("scatter", max_coc=largest, kernel=_KERNELS[kernel])
+        search.trial(other, f'the kernel "{kernel}", by "{_KERNELS[kernel]}"')
 
 
 def _gathered(search: Search, largest: float) -> None:
     """Try gather by some taps, by more, and by as many as should do."""
 
-    def errs(taps: int) -> Trial:
+    def by(taps: int) -> Trial:
         how = Method("gather", max_coc=largest, taps=taps)
         return search.trial(how, f"exact discs, by gather of {taps} taps")
 
-    few = errs(_FEW)
+    few = by(_FEW)
     # More taps take longer still.
-    if few.seconds > search.seconds or few.error <= search.max_error:
+    if few.time > 1 or few.error <= search.max_error or (more := by(_MORE)).time > 1:
         return
-    more = errs(_MORE)
-    # The squared error is `bias + variance / taps`.
-    variance = (few.error**2 - more.error**2) / (1 / _FEW - 1 / _MORE)
-    room = search.max_error**2 - (more.error**2 - variance / _MORE)
+    # Where both were tried, the squared error is `bias + variance / taps`.
+    pairs = zip(few.squares, more.squares, strict=False)
+    one, other = map(sum, zip(*pairs, strict=True))
+    variance = (one - other) / (1 / _FEW - 1 / _MORE)
+    room = search.max_error**2 - (other - variance / _MORE)
     if room > 0 and _MORE < variance / room <= _MOST:
-        errs(2 ** math.ceil(math.log2(variance / room)))
+        by(2 ** math.ceil(math.log2(variance / room)))

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxfx._numerics import working_dtype
-from jaxfx.budget._plan import Plan, Search, check_call, root_mean_square
-from jaxfx.budget._tiles import Blocks, blocks, spend, sums, tile_of
+from jaxfx.budget._plan import Part, Plan, Search, Trial, check_call
+from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of, tile_sums
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight
-from jaxfx.relight.shading import reflected, render, shade, to_surface
+from jaxfx.light import Light
+from jaxfx.relight.shading import Surface, reflected, render, to_surface
 from jaxfx.relight.state import start
 
 
@@ -25,8 +25,14 @@ from jaxfx.relight.state import start
 _EVERYWHERE = 1 / 3
 # The share of the error that shadows may take.
 _SHADOWS = 1 / 4
-# What of a light of each kind tells how near it is to another.
-_PLACE = {AmbientLight: None, DirectionalLight: "direction", PointLight: "position"}
+_TINY = np.finfo(float).tiny
+# What of a light tells how near it is to another of its kind, and of how many numbers it is.
+_PLACE = {"position": 3, "direction": 3, "inner_angle": 1, "outer_angle": 1}
+# As many must be saved by merging, of all, to try it.
+_SAVED = 1 / 4
+# Merged lights are tried in every fourth pixel of a row and of a column, if the picture has so
+# many pixels.
+_EVERY, _MANY = 4, 4096
 
 
 class Everything(eqx.Module):
@@ -100,11 +106,13 @@ def relight(
     is needed in a few tiles is computed in these. A light whose shadow takes next to nothing
     away does without: its shadow map need not be made.
 
-    Apart from that, lights are merged: of one kind those first that are dim and near, into half
-    as many, a quarter, and so on, for as long as the picture is within the error. The quicker
-    of the two ways is taken.
+    Apart from that, lights are merged: of one kind those first that are dim and near (spot
+    lights: that also shine alike), into the fewest that keep to the error in every fourth pixel
+    of a row and of a column; found by halving. The quicker of the two ways is taken, if its
+    error holds on the whole picture.
 
-    It costs a rendering of each light alone, and one by each way.
+    It costs two renderings, one for the proof and one light by light, one by each of the two
+    ways, and less than half of one to merge.
 
     **Arguments:**
 
@@ -127,10 +135,9 @@ def relight(
     """
     data = (gbuffer, camera, tuple(lights))
     data = data if visibilities is None else (*data, tuple(visibilities))
-    data = (gbuffer, camera, tuple(lights))
-    data = data if visibilities is None else (*data, tuple(visibilities))
     max_error = check_call("relight", max_error, data)
-    search = Search(Everything(), data, max_error)
+    parts = _parts(gbuffer, camera, *data[2:])
+    search = Search(Everything(), data, max_error, parts)
     if lights:
         brought = _bring(gbuffer, camera, lights, visibilities or [None] * len(lights))
         _try_merging(search, brought, lights)
@@ -138,10 +145,32 @@ def relight(
     return search.plan()
 
 
-class _Brought(NamedTuple):
-    """What lights bring alone, as sums of squares over tiles, and what their shadows take."""
+def _parts(gbuffer: GBuffer, camera: Any, *lights: Any) -> list[Part]:
+    """Some pixels of a scene, in rows and columns, as a camera of fewer pixels sees them."""
+    if gbuffer.depth.size < _MANY:
+        return []
+    some = (slice(_EVERY // 2, None, _EVERY),) * 2
+    # The pixel centres of the one camera at those of the other.
+    shift = 0.5 - (_EVERY // 2 + 0.5) / _EVERY
+    pose = camera.world_from_camera
+    if isinstance(camera, OrthographicCamera):
+        scale, centre = camera.pixels_per_unit / _EVERY, camera.centre / _EVERY + shift
+        camera = OrthographicCamera(scale, centre, pose)
+    else:
+        fewer = np.array([[1 / _EVERY, 0, shift], [0, 1 / _EVERY, shift], [0, 0, 1]])
+        fewer = fewer.astype(camera.intrinsics.dtype)
+        camera = PinholeCamera(fewer @ camera.intrinsics, pose)
+    lights, *visibilities = lights
+    visibilities = jax.tree.map(lambda x: jnp.asarray(x)[some], visibilities)
+    return [Part((jax.tree.map(lambda x: x[some], gbuffer), camera, lights, *visibilities))]
 
-    tile: Int[np.ndarray, " pixel"]
+
+class _Brought(NamedTuple):
+    """What lights bring alone, as sums of squares over tiles, and what their shadows take.
+
+    - `shadows`: by light, the root mean square that the shadow takes away, where there is one.
+    """
+
     size: int
     energy: Float[np.ndarray, "tile light"]
     lit: Float[np.ndarray, "tile light"]
@@ -159,22 +188,17 @@ class _Brought(NamedTuple):
 
 
 def _bring(gbuffer: Any, camera: Any, lights: Any, visibilities: Any) -> _Brought:
-    tile = tile_of(gbuffer.depth.shape)
-    squares = lambda image: sums(
-        np.square(np.asarray(image, float)).sum(-1).reshape(1, -1), tile
-    )
-    lit, dark, shadows = [], [], {}
-    for index, (light, visible) in enumerate(zip(lights, visibilities, strict=True)):
-        picture = shade(gbuffer, camera, light)
-        lit.append(squares(picture))
-        dark.append(lit[-1])
-        if visible is not None:
-            shaded = shade(gbuffer, camera, light, visible)
-            dark[-1] = squares(shaded)
-            shadows[index] = root_mean_square(picture - shaded)
-    size = gbuffer.color.size
-    beside = lambda columns: np.concatenate(columns, axis=1)
-    return _Brought(tile, size, beside(dark), beside(lit), shadows)
+    size, tiles = gbuffer.color.size, 1 + tile_of(gbuffer.depth.shape)[-1]
+    energy, lit = np.zeros((2, tiles, len(lights)))
+    shadows = {}
+    for members in _kinds(lights, visibilities):
+        some = [(lights[n], visibilities[n]) for n in members]
+        squares = np.asarray(_squares(gbuffer, camera, some), float)
+        lit[:, members], energy[:, members] = squares[0].T, squares[1].T
+        if visibilities[members[0]] is not None:
+            taken = np.sqrt(squares[2].sum(axis=1) / size)
+            shadows |= dict(zip(members, taken.tolist(), strict=True))
+    return _Brought(size, energy, lit, shadows)
 
 
 def _try_tiles(search: Search, brought: _Brought) -> None:
@@ -204,10 +228,17 @@ def _try_tiles(search: Search, brought: _Brought) -> None:
         texts.append(f"{_named('light', some.tolist())} in {outside:.0%} of their tiles")
     if free:
         texts.append(f"{_named('shadow', sorted(free))}, {spent:.2g} at most")
-    lights = search.whole[0].data[2]
-    pixels = blocks(parts[:, brought.tile], lights)
+    lights = search.data[2]
+    pixels = blocks(parts[:, tile_of(search.data[0].depth.shape)], lights)
     reads = tuple(n for n in shadowed if share[n] > 0)
-    search.trial(Tiled(tuple(everywhere.tolist()), reads, pixels), "; ".join(texts))
+    way = Tiled(tuple(everywhere.tolist()), reads, pixels)
+    # If its part of the work is no less than what merged lights take, it is not measured.
+    work = float(np.minimum(share / _EVERYWHERE, 1).mean())
+    merged = [trial.time for trial in search.tried if trial.error <= search.max_error]
+    if work < min(merged, default=1):
+        search.measure(way, "; ".join(texts))
+    else:
+        search.tried.append(Trial(way, "; ".join(texts), (), work))
 
 
 def _named(kind: str, indices: Sequence[Any]) -> str:
@@ -216,38 +247,44 @@ def _named(kind: str, indices: Sequence[Any]) -> str:
 
 
 def _try_merging(search: Search, brought: _Brought, lights: Sequence[Light]) -> None:
-    """Try half as many lights, a quarter, and so on, for as long as that will do."""
+    """Try to merge lights, into the fewest that will do: found by halving."""
     free, _ = brought.free(search.max_error)
     shadowed = tuple(index for index in brought.shadows if index not in free)
-    alone = [index for index, light in enumerate(lights) if type(light) not in _PLACE]
-    groups: dict[tuple[int, ...], _Place]
-    groups = {(index,): _Place.of(light) for index, light in enumerate(lights)}
-    wanted = len(groups) // 2
-    while wanted:
-        before = len(groups)
-        while len(groups) > wanted and (pair := _nearest(groups, {*shadowed, *alone})):
-            one, other = (groups.pop(group) for group in pair)
-            groups[tuple(sorted(pair[0] + pair[1]))] = one.joined(other)
-        if len(groups) == before:
-            return
-        text = f"what {len(lights)} lights have beyond {len(groups)} merged ones"
-        if search.trial(Merged(tuple(sorted(groups)), shadowed), text).error > search.max_error:
-            return
-        wanted = len(groups) // 2
+    depth = np.asarray(search.data[0].depth)
+    reach = float(np.mean(depth, where=np.isfinite(depth))) if np.isfinite(depth).any() else 1
+    places = {(index,): _Place.of(light, reach) for index, light in enumerate(lights)}
+    # The groups that there are as one pair after another is joined.
+    groups = [tuple(places)]
+    while pair := _nearest(places, shadowed):
+        one, other = (places.pop(group) for group in pair)
+        places[tuple(sorted(pair[0] + pair[1]))] = one.joined(other)
+        groups.append(tuple(sorted(places)))
+    low, high = int(_SAVED * len(lights)) + 1, len(groups)
+    while low < high:
+        middle = (low + high) // 2
+        text = f"what {len(lights)} lights have beyond {len(groups[middle])} merged ones"
+        trial = search.trial(Merged(groups[middle], shadowed), text)
+        low, high = (middle + 1, high) if trial.error <= search.max_error else (low, middle)
 
 
 class _Place(NamedTuple):
     """Where a light is, and how bright."""
 
-    kind: type
-    where: Float[np.ndarray, "3"]
+    kind: str
+    where: Float[np.ndarray, "8"]
     bright: float
 
     @classmethod
-    def of(cls, light: Light) -> "_Place":
-        name = _PLACE.get(type(light))
-        where = np.asarray(getattr(light, name), float) if name else np.zeros(3)
-        return cls(type(light), where, float(jnp.abs(light.color).sum()))
+    def of(cls, light: Light, reach: float) -> "_Place":
+        """In scene units: an angle is how far it moves what lies at a distance of `reach`."""
+        fields = [
+            np.broadcast_to(np.asarray(getattr(light, name, 0), float), size)
+            for name, size in _PLACE.items()
+        ]
+        position, direction, *angles = fields
+        turns = [direction / max(np.linalg.norm(direction), _TINY), *angles]
+        where = np.concatenate([position, *(reach * turn for turn in turns)])
+        return cls(type(light).__name__, where, float(jnp.abs(light.color).sum()))
 
     def joined(self, other: "_Place") -> "_Place":
         """Both, in their mean place."""
@@ -256,14 +293,14 @@ class _Place(NamedTuple):
         return _Place(self.kind, (1 - share) * self.where + share * other.where, total)
 
 
-def _nearest(groups: dict[tuple[int, ...], _Place], apart: set[int]) -> Any:
+def _nearest(groups: dict[tuple[int, ...], _Place], apart: Sequence[int]) -> Any:
     """The two groups of one kind that lose least by joining; None if there are none."""
     keys = [group for group in groups if group[0] not in apart]
-    kind = np.array([list(_PLACE).index(groups[key].kind) for key in keys])
-    where = np.array([groups[key].where for key in keys]).reshape(-1, 3)
+    kind = np.array([groups[key].kind for key in keys])
+    where = np.array([groups[key].where for key in keys]).reshape(len(keys), -1)
     bright = np.array([groups[key].bright for key in keys])
     far = np.square(where[:, None] - where[None]).sum(axis=-1)
-    total = np.maximum(bright[:, None] + bright[None], np.finfo(float).tiny)
+    total = np.maximum(bright[:, None] + bright[None], _TINY)
     lost = far * bright[:, None] * bright[None] / total
     lost[(kind[:, None] != kind[None]) | np.tri(len(keys), dtype=bool)] = np.inf
     if not np.isfinite(lost).any():
@@ -285,6 +322,43 @@ def _merged(lights: Sequence[Any]) -> Any:
     return eqx.tree_at(lambda light: light.color, mean, jnp.sum(all_of_them.color, axis=0))
 
 
+def _kinds(lights: Sequence[Light], shadows: Sequence[Any]) -> list[list[int]]:
+    """The lights of each kind, those that have a shadow apart: each a program's loop."""
+    kinds: dict[str, list[int]] = {}
+    for index, (light, shadow) in enumerate(zip(lights, shadows, strict=True)):
+        kinds.setdefault(f"{type(light)} {shadow is None}", []).append(index)
+    return [kinds[kind] for kind in sorted(kinds)]
+
+
+def _stacked(some: Sequence[Any], surface: Surface) -> tuple[Any, Any]:
+    """Lights of a kind and, where one has a shadow, the shadows of all."""
+    lights, shadows = zip(*some, strict=True)
+    together = lambda *x: jnp.stack([y.astype(surface.position.dtype) for y in x])
+    lights = jax.tree.map(together, *lights)
+    if all(shadow is None for shadow in shadows):
+        return lights, None
+    lit = jnp.ones_like(surface.position[..., 0])
+    shadows = together(*(lit if shadow is None else jnp.asarray(shadow) for shadow in shadows))
+    return lights, jnp.where((surface.shader < 0)[None], 0, shadows)
+
+
+@jax.jit
+def _squares(gbuffer, camera, some):
+    """Of each light the tiles' sums of squares: without its shadow, with it, what it takes."""
+    surface = to_surface(gbuffer, camera)
+
+    def each(both):
+        light, shadow = both
+        picture = reflected(surface, light)
+        if shadow is None:
+            return 2 * (tile_sums(picture**2),)
+        shadow = shadow[..., None]
+        parts = picture, picture * shadow, picture * (1 - shadow)
+        return tuple(tile_sums(part**2) for part in parts)
+
+    return jax.lax.map(each, _stacked(some, surface))
+
+
 @jax.jit
 def _tiled(gbuffer, camera, everywhere, parts):
     """The picture by lights and their shadows, and by those that are for some pixels."""
@@ -292,31 +366,19 @@ def _tiled(gbuffer, camera, everywhere, parts):
     image = jnp.zeros_like(surface.position)
     again = jax.checkpoint(reflected, prevent_cse=False)
 
-    def stacked(some):
-        """Lights and, where one has a shadow, the shadows of all."""
-        lights, shadows = zip(*some, strict=True)
-        together = lambda *x: jnp.stack([y.astype(image.dtype) for y in x])
-        lights = jax.tree.map(together, *lights)
-        if all(shadow is None for shadow in shadows):
-            return lights, None
-        lit = jnp.ones(surface.shader.shape, image.dtype)
-        shadows = together(*(lit if shadow is None else shadow for shadow in shadows))
-        return lights, jnp.where((surface.shader < 0)[None], 0, shadows)
-
     def add(image, each):
         light, shadow = each
         part = again(surface, light)
         return image + (part if shadow is None else part * shadow[..., None]), None
 
-    kinds = {(type(light), shadow is None) for light, shadow in everywhere}
-    for kind in sorted(kinds, key=str):
-        some = [each for each in everywhere if (type(each[0]), each[1] is None) == kind]
-        image, _ = jax.lax.scan(add, image, stacked(some))
+    for members in _kinds(*zip(*everywhere, strict=True)) if everywhere else []:
+        some = [everywhere[n] for n in members]
+        image, _ = jax.lax.scan(add, image, _stacked(some, surface))
 
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), surface)
     pixels = image.reshape(-1, 3)
     for some, *of_each in parts:
-        lights, shadows = stacked(some)
+        lights, shadows = _stacked(some, surface)
 
         @jax.checkpoint
         def block(pixels, each, lights=lights, shadows=shadows):

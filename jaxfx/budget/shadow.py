@@ -1,6 +1,7 @@
 """Shadows within an error."""
 
 import functools as ft
+import math
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -11,59 +12,42 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxfx._numerics import parameter
-from jaxfx.budget._plan import Plan, Search, check_call, plan, timed
+from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
 from jaxfx.shadow import _taps
 from jaxfx.shadow.edge import candidates, edge_pcf
-from jaxfx.shadow.pcf import average, hard, pcf
+from jaxfx.shadow.pcf import average, pcf
 from jaxfx.shadow.receivers import Receivers
 
 
-class Hard(eqx.Module):
-    """`shadow.hard`."""
-
-    bias: Float[Array, ""]
-    slope_bias: Float[Array, ""]
-    title: ClassVar[str] = "hard shadow"
-
-    def __call__(self, shadow_map: Any, receivers: Any) -> Any:
-        """As the effect."""
-        return hard(shadow_map, receivers, bias=self.bias, slope_bias=self.slope_bias)
+# Pixels that tell how a smaller filter errs.
+_SOME = 4096
 
 
-class Everywhere(eqx.Module):
-    """`shadow.pcf`."""
+class Filter(eqx.Module):
+    """`shadow.pcf`, everywhere or where the mask by depth has it, to the same end.
+
+    Of size 1 it is `shadow.hard`, and needs no mask.
+    """
 
     bias: Float[Array, ""]
     slope_bias: Float[Array, ""]
     size: int = eqx.field(static=True)
-    title: ClassVar[str] = "shadow filtered everywhere"
+    masked: bool = eqx.field(static=True)
+
+    @property
+    def title(self) -> str:
+        """What it is."""
+        if self.size == 1:
+            return "hard shadow"
+        return f"shadow filtered {'where its edges are' if self.masked else 'everywhere'}"
 
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
         """As the effect."""
-        return pcf(
-            shadow_map, receivers, size=self.size, bias=self.bias, slope_bias=self.slope_bias
-        )
-
-
-class Edge(eqx.Module):
-    """`shadow.edge_pcf` with the mask by depth, which is `shadow.pcf` of its size exactly."""
-
-    bias: Float[Array, ""]
-    slope_bias: Float[Array, ""]
-    size: int = eqx.field(static=True)
-    title: ClassVar[str] = "shadow filtered where its edges are"
-
-    def __call__(self, shadow_map: Any, receivers: Any) -> Any:
-        """As the effect."""
-        return edge_pcf(
-            shadow_map,
-            receivers,
-            size=self.size,
-            bias=self.bias,
-            slope_bias=self.slope_bias,
-            mask="depth",
-        )
+        how = {"size": self.size, "bias": self.bias, "slope_bias": self.slope_bias}
+        if self.masked and self.size > 1:
+            return edge_pcf(shadow_map, receivers, mask="depth", **how)
+        return pcf(shadow_map, receivers, **how)
 
 
 class Picked(eqx.Module):
@@ -79,19 +63,33 @@ class Picked(eqx.Module):
         """As the effect."""
         data = (shadow_map, receivers, self.bias, self.slope_bias)
         data = _taps.checked("shadow", *data, size=self.size)
-        return _picked(*data[:4], self.size, self.pixels)
+        return _picked(self.size, self.pixels, *data[:4])
 
 
-@ft.partial(jax.jit, static_argnames=("size",))
-def _picked(shadow_map, receivers, bias, slope_bias, size, pixels):
-    dtype = _taps.common_dtype(shadow_map, receivers)
-    texels = _taps.pad_map(shadow_map, size, dtype)
-    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
-    some = jax.tree.map(lambda x: x.reshape(-1).at[pixels].get(mode="clip"), places)
+@ft.partial(jax.jit, static_argnums=0)
+def _picked(size, pixels, shadow_map, receivers, bias, slope_bias):
+    texels, places, some = _at(size, pixels, shadow_map, receivers, bias, slope_bias)
     soft = average(texels, some, None, size, "box")
     result = average(texels, places, None, 1, "box").reshape(-1)
     result = result.at[pixels].set(soft, mode="drop").reshape(receivers.z.shape)
     return jax.lax.stop_gradient(result).astype(receivers.z.dtype)
+
+
+@ft.partial(jax.jit, static_argnums=0)
+def _squares(size, pixels, *data):
+    """The mean squared errors of all smaller filters in some pixels, from size 1 on."""
+    texels, _, some = _at(size, pixels, *data)
+    *less, full = (average(texels, some, None, n, "box") for n in range(1, size + 1, 2))
+    return [jnp.mean((each - full) ** 2) for each in less]
+
+
+def _at(size, pixels, shadow_map, receivers, bias, slope_bias):
+    """What is compared: the map, the places of all pixels, and those of some."""
+    dtype = _taps.common_dtype(shadow_map, receivers)
+    texels = _taps.pad_map(shadow_map, size, dtype)
+    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
+    some = jax.tree.map(lambda x: x.reshape(-1).at[pixels].get(mode="clip"), places)
+    return texels, places, some
 
 
 def shadow(
@@ -109,7 +107,10 @@ def shadow(
     than 1: where the square root of the mask's share is within the error, the hard shadow is
     taken and nothing else is tried. Else the filter is tried where the mask has it, which costs
     no error; in the pixels alone where it makes most of a difference on this scene, which needs
-    no mask, but knows no other scene; and smaller filters.
+    no mask, but knows no other scene; and the smallest filter that keeps to the error in 4096
+    pixels of the mask.
+
+    It costs about three renderings: the effect, for the proof, the mask, and each of the ways.
 
     **Arguments:**
 
@@ -133,32 +134,41 @@ def shadow(
         shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1], mask="depth"
     ).where
     share = float(jnp.mean(where))
-    text = "the filter"
-    data = (shadow_map, receivers)
+    by = lambda size, masked=True: Filter(*biases, size, masked)
+    data, text = (shadow_map, receivers), "the filter"
     if share**0.5 <= max_error:
         why = f"it can't matter in more than {share:.2%} of the pixels."
-        seconds = timed(Hard(*biases), data)[1]
-        return plan(Hard(*biases), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
-    search = Search(Everywhere(*biases, size), data, max_error)
-    outside = f"the filter outside of the {share:.1%} of the pixels where it matters"
-    search.trial(Edge(*biases, size), outside)
-    picked = _pick(search, Hard(*biases))
-    if picked.size:
+        seconds = timed(by(1), data)[1]
+        return plan(by(1), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
+    search = Search(by(size, False), data, max_error)
+    outside = f"{text} outside of the {share:.1%} of the pixels where it matters"
+    search.measure(by(size), outside)
+    if (picked := _pick(search, by(1))).size:
         few = np.count_nonzero(picked < where.size) / where.size
-        some = f"the filter but in {few:.1%} of the pixels, held fixed"
-        search.trial(Picked(*biases, size, jnp.asarray(picked, jnp.int32)), some)
-    for smaller in range(1, size, 2):
-        call = Hard(*biases) if smaller == 1 else Edge(*biases, smaller)
+        some = f"{text} but in {few:.1%} of the pixels, held fixed"
+        search.measure(Picked(*biases, size, jnp.asarray(picked, jnp.int32)), some)
+    # Filters differ inside the mask alone, and so by how much can be told from some of it.
+    inside = np.flatnonzero(where)
+    inside = inside[np.linspace(0, inside.size - 1, min(_SOME, where.size)).astype(int)]
+    probed = _taps.checked("shadow", *data, *biases, size=size)[:4]
+    for smaller, square in zip(range(1, size, 2), _squares(size, inside, *probed), strict=True):
         less = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
-        if search.trial(call, less).error <= max_error:
+        if (square := share * float(square)) > max_error**2:
+            search.tried.append(Trial(by(smaller), less, (square,), math.inf))
+        elif search.measure(by(smaller), less).error <= max_error:
             break
     return search.plan()
 
 
-def _pick(search: Search, hard: Hard) -> Int[np.ndarray, " pixel"]:
+def _pick(search: Search, hard: Filter) -> Int[np.ndarray, " pixel"]:
     """The pixels that need the filter, to whole blocks; those first where it matters most."""
-    (full,) = search.references
-    squares = np.square(np.asarray(hard(*search.whole[0].data) - full, float)).reshape(-1, 1)
-    steps = spend(np.pad(squares, ((0, 0), (1, 0))), search.max_error, full.size)
-    pixels = [np.asarray(part.pixels) for part in blocks((steps == 0)[None], [full])]
-    return pixels[0].reshape(-1) if pixels else np.zeros(0, int)
+    full = search.whole[1]
+    squares = np.square(np.asarray(hard(*search.data) - full, float)).ravel()
+    # All others take no step.
+    differ = np.flatnonzero(squares)
+    steps = np.pad(squares[differ, None], ((0, 0), (1, 0)))
+    uses = np.zeros((1, full.size), bool)
+    uses[0, differ] = spend(steps, search.max_error, full.size) == 0
+    return np.concatenate(
+        [np.zeros(0, int), *(part.pixels.ravel() for part in blocks(uses, [full]))]
+    )

@@ -73,13 +73,13 @@ def blend(
     size = check_options("blend", shape or images[0].shape[:2], method, hole_threshold)
     depths = _checked("blend", depths, [image.shape[:2] for image in images], sources, target)
     options = {"method": method, "hole_threshold": hole_threshold}
-    seen = _Seen(target, pixel_centers(*size).reshape(-1, 2), options)
+    seen = Sight(target, pixel_centers(*size).reshape(-1, 2), options)
     return _blended(seen, images, depths, list(sources), size)
 
 
 @eqx.filter_jit
 def _blended(
-    seen: "_Seen", images: list, depths: list, sources: list, size: tuple[int, int]
+    seen: "Sight", images: list, depths: list, sources: list, size: tuple[int, int]
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     hole_threshold = seen.options["hole_threshold"]
 
@@ -143,11 +143,11 @@ def choose(
     pixels = pixel_centers(height, width)[rows, columns].reshape(-1, 2)
     depths = _checked("choose", depths, list(map(jnp.shape, depths)), sources, target)
     options = {"method": "pyramid", "hole_threshold": hole_threshold}
-    return _chosen(_Seen(target, pixels, options), depths, list(sources), count)
+    return _chosen(Sight(target, pixels, options), depths, list(sources), count)
 
 
 @eqx.filter_jit
-def _chosen(seen: "_Seen", depths: list, sources: list, count: int) -> Choice:
+def _chosen(seen: "Sight", depths: list, sources: list, count: int) -> Choice:
     def each(depth: Array, source: PinholeCamera) -> Array:
         view, along, _ = seen(depth, source)
         return jnp.where(view.mask, along, 0)
@@ -195,7 +195,7 @@ def _over_sources(function: Callable, *lists: Sequence) -> Any:
     return jax.tree.map(stack, *results)
 
 
-class _Seen(eqx.Module):
+class Sight(eqx.Module):
     """What some of a target's pixels see of a source."""
 
     target: Camera

@@ -1,5 +1,6 @@
 """Plans for lights."""
 
+import importlib
 import inspect
 
 import equinox as eqx
@@ -14,14 +15,15 @@ from jaxfx import (
     GBuffer,
     PinholeCamera,
     PointLight,
+    SpotLight,
     budget,
     relight,
 )
 from jaxfx.budget._tiles import blocks
-from jaxfx.budget.relight import Merged, Tiled
+from jaxfx.budget.relight import Merged, Tiled, _nearest, _Place
 
 
-SIZE, COUNT = (8, 10), 5
+SIZE, COUNT = (8, 16), 4
 
 
 def scene(rng):
@@ -41,7 +43,10 @@ def scene(rng):
 
 @pytest.fixture(scope="module")
 def plans(promised):
-    return promised(scene, budget.relight, relight.render, (-3, -1))
+    """Of pictures just large enough that merged lights are tried in some of their pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.import_module("jaxfx.budget.relight"), "_MANY", 128)
+        return promised(scene, budget.relight, relight.render, (-3, -1))
 
 
 def test_no_plan_exceeds_its_error(plans):
@@ -63,7 +68,7 @@ def test_lights_are_computed_where_they_are_needed():
     """Against the picture of each light times the pixels that it is for."""
     rng = np.random.default_rng(2)
     cache, camera, lights = scene(rng)
-    visibilities = [rng.uniform(0, 1, SIZE), None, rng.uniform(0, 1, SIZE), None, None]
+    visibilities = [rng.uniform(0, 1, SIZE), None, rng.uniform(0, 1, SIZE), None]
     where = rng.uniform(0, 1, (COUNT, *SIZE)) < 0.5
     where[0] = True
     parts = where.reshape(COUNT, -1) & (np.arange(COUNT) > 0)[:, None]
@@ -98,13 +103,13 @@ def test_a_light_that_reaches_a_corner_is_computed_there_alone():
 
 
 def test_shadows_that_take_nothing_away_need_no_map():
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(5)
     cache, camera, lights = scene(rng)
-    visibilities = [np.ones(SIZE), rng.uniform(0, 1, SIZE), np.ones(SIZE), None, None]
+    visibilities = [np.ones(SIZE), rng.uniform(0, 1, SIZE), np.ones(SIZE), None]
     full = relight.start(cache, camera, lights, visibilities=visibilities).image
     plan = budget.relight(cache, camera, lights, visibilities=visibilities, max_error=1e-4)
     assert "shadows 0, 2, 0 at most" in str(plan)
-    without = plan(cache, camera, lights, [None, visibilities[1], None, None, None])
+    without = plan(cache, camera, lights, [None, visibilities[1], None, None])
     assert np.sqrt(np.mean((without - full) ** 2)) <= 1e-4
 
 
@@ -113,18 +118,32 @@ def test_lights_in_one_place_become_one():
     cache, camera, (near, far, *_) = scene(np.random.default_rng(4))
     copies = [PointLight(near.position, near.color * share) for share in (0.5, 0.3, 0.2)]
     ambient = [AmbientLight([0.1, 0.2, 0.3]), AmbientLight([0.3, 0.0, 0.1])]
-    plan = Merged(((0, 1, 2), (3,), (4, 5)), ())
-    lights = [*copies, far, *ambient]
+    spot = lambda share: SpotLight([0, 0, 0], [0, 0.2, 1], [share] * 3, 0.2, 0.5)
+    plan = Merged(((0, 1, 2), (3,), (4, 5), (6, 7)), ())
+    lights = [*copies, far, *ambient, spot(0.5), spot(0.7)]
     picture = lambda brighter: plan(
         cache, camera, [PointLight(near.position, near.color * 0.5 * brighter), *lights[1:]]
     )
-    full = relight.render(cache, camera, [near, far, AmbientLight([0.4, 0.2, 0.4])])
+    fewer = [near, far, AmbientLight([0.4, 0.2, 0.4]), spot(1.2)]
+    full = relight.render(cache, camera, fewer)
     np.testing.assert_allclose(picture(1.0), full, rtol=1e-9)
     slope = jax.jvp(picture, (1.0,), (1.0,))[1]
     alone = relight.shade(cache, camera, copies[0])
     np.testing.assert_allclose(slope, alone, rtol=1e-9)
-    found = budget.relight(cache, camera, copies, max_error=1e-9)
+    spots = [spot(share) for share in (0.5, 0.3, 0.2)]
+    found = budget.relight(cache, camera, spots, max_error=1e-9)
     assert "what 3 lights have beyond 1 merged ones" in str(found)
+
+
+def test_spot_lights_are_near_that_shine_alike():
+    """Turned by 0.1 radians, or wider by as much, at a reach of 4 it is 0.4 away."""
+    spot = lambda x, turn, wider: SpotLight(
+        [x, 0, 0], [np.sin(turn), 0, np.cos(turn)], [1, 1, 1], 0.1, 0.5 + wider
+    )
+    for away in ((-0.3, 0, 0), (0, -0.07, 0), (0, 0, -0.07)):
+        lights = spot(0, 0, 0), spot(0.4, 0, 0), spot(0, 0.1, 0), spot(0, 0, 0.1), spot(*away)
+        places = {(n,): _Place.of(light, 4.0) for n, light in enumerate(lights)}
+        assert _nearest(places, ()) == ((0,), (4,))
 
 
 def test_a_negative_error_is_refused():

@@ -35,7 +35,7 @@ def test_what_parts_do_not_show_the_whole_scene_does():
     plan = search(hidden, honest)
     assert plan.recipe is honest
     np.testing.assert_allclose(plan.predicted_error, 0.05)
-    assert "not taken: number 0: errs by 0.71" in str(plan)
+    assert "not taken: number 0: errs by 0.71." in str(plan)
     assert float(plan.predicted_seconds) < float(plan.full_seconds)
 
 
