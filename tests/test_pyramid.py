@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 
 from jaxfx._pyramid import maximum_pyramid, minimum_pyramid
 
@@ -16,10 +17,15 @@ SIZES = [(1, 1), (1, 2), (2, 3), (5, 1), (17, 5), (61, 64), (64, 257)]
 )
 def test_each_texel_is_the_extreme_of_what_it_covers(pyramid, extreme, size):
     depth = np.random.default_rng(0).normal(size=size)
-    made = pyramid(jnp.asarray(depth))
-    for k in range(len(made.shapes)):
+
+    @quick_jit
+    def levels(depth):
+        made = pyramid(depth)
+        return made, [made.level(k) for k in range(len(made.shapes))]
+
+    made, found = levels(depth)
+    for k, level in enumerate(map(np.asarray, found)):
         side = 2**k
-        level = np.asarray(made.level(k))
         assert level.shape == made.shapes[k] == tuple(-(-n // side) for n in size)
         for j, i in np.ndindex(*level.shape):
             covered = depth[j * side : (j + 1) * side, i * side : (i + 1) * side]

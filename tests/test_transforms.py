@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quick import quick_jit
 
 import jaxfx
 import jaxfx.shadow
@@ -299,15 +300,6 @@ for _name, _function in FUNCTIONS.items():
     _found, MISSING[_name] = _cases(_name, _function)
     CASES |= _found
 
-# Compiling is most of the work. `test_jit` does it as a user does; the others may save on it.
-quick_jit = functools.partial(
-    jax.jit,
-    compiler_options={
-        "xla_backend_optimization_level": 0,
-        "xla_cpu_use_fusion_emitters": False,
-    },
-)
-
 
 def each(cases):
     """Parametrize by cases, so that a case's tests follow one another and share `program`."""
@@ -318,7 +310,8 @@ def each(cases):
 def program(case):
     """The function of a case, compiled; as it is; and its arguments."""
     call, arguments = case.split(eqx.is_array)
-    return jax.jit(call), call, arguments
+    # What differs by a type of argument alone goes through the same code as another case.
+    return (jax.jit if case.is_option else quick_jit)(call), call, arguments
 
 
 def _normal(tree, seed=7):

@@ -1,8 +1,11 @@
 """Programs that are quick to compile, for what is asked of neither speed nor memory."""
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
+from jax.test_util import check_jvp, check_vjp
 
 
 # Compiling is most of the tests' work. What a user runs is compiled with all optimisation: that
@@ -14,3 +17,14 @@ quick_jit = functools.partial(
         "xla_cpu_use_fusion_emitters": False,
     },
 )
+
+
+def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: float) -> None:
+    """What `jax.test_util.check_grads` checks of first order, in three programs: forward and
+    reverse mode against differences."""
+    value, push = quick_jit(function), quick_jit(functools.partial(jax.jvp, function))
+    pull = quick_jit(lambda at, weight: jax.vjp(function, *at)[1](weight))
+    check_jvp(value, push, arguments, **tolerances)
+    check_vjp(
+        value, lambda *at: (value(*at), functools.partial(pull, at)), arguments, **tolerances
+    )
