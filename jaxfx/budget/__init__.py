@@ -1,6 +1,6 @@
 """The cheapest settings of an effect within an error: model no more than a scene needs.
 
-A plan has its price: the time of about three renderings at full quality, of which one is the
+A plan has its price: the time of two to four renderings at full quality, of which one is the
 proof, and, at first, seconds to compile what is tried. It pays where a scene is drawn again and
 again: with other lights, in a loop that fits.
 """

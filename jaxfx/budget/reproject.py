@@ -76,7 +76,7 @@ def reproject(
     What is left is drawn and measured against the effect.
 
     Rays take as many steps as they need. A bound on them is not planned: the most that any ray
-    takes saves nothing, and one that saves an eighth of a walk loses a twentieth of its rays.
+    takes saves nothing, and one that saves 7 % of a walk cuts 5 % of its rays short.
 
     It costs two renderings of all sources, one for the proof and one apart, and one by the
     plan.

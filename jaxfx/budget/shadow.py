@@ -105,12 +105,13 @@ def shadow(
 
     Outside the mask by depth the hard shadow is the filtered one, inside it differs by less
     than 1: where the square root of the mask's share is within the error, the hard shadow is
-    taken and nothing else is tried. Else the filter is tried where the mask has it, which costs
-    no error; in the pixels alone where it makes most of a difference on this scene, which needs
-    no mask, but knows no other scene; and the smallest filter that keeps to the error in 4096
+    taken and nothing else is tried. Else the filter is tried in the pixels alone where it makes
+    most of a difference on this scene, which knows no other scene; where the mask has it, if
+    that is less, which costs no error; and the smallest filter that keeps to the error in 4096
     pixels of the mask.
 
-    It costs about three renderings: the effect, for the proof, the mask, and each of the ways.
+    It costs one rendering for the proof, one by each way, and about as much as another two to
+    find the mask and the pixels.
 
     **Arguments:**
 
@@ -141,12 +142,15 @@ def shadow(
         seconds = timed(by(1), data)[1]
         return plan(by(1), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
     search = Search(by(size, False), data, max_error)
-    outside = f"{text} outside of the {share:.1%} of the pixels where it matters"
-    search.measure(by(size), outside)
-    if (picked := _pick(search, by(1))).size:
-        few = np.count_nonzero(picked < where.size) / where.size
+    picked = _pick(search, by(1))
+    few = np.count_nonzero(picked < where.size) / where.size
+    if few:
         some = f"{text} but in {few:.1%} of the pixels, held fixed"
         search.measure(Picked(*biases, size, jnp.asarray(picked, jnp.int32)), some)
+    # Fewer pixels, and no mask, can't take longer.
+    if not 0 < few < share:
+        outside = f"{text} outside of the {share:.1%} of the pixels where it matters"
+        search.measure(by(size), outside)
     # Filters differ inside the mask alone, and so by how much can be told from some of it.
     inside = np.flatnonzero(where)
     inside = inside[np.linspace(0, inside.size - 1, min(_SOME, where.size)).astype(int)]

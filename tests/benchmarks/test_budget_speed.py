@@ -5,13 +5,16 @@ ratio of the full effect to its plan at an error of 1e-2. The lens has circles u
 (wide) or 25 (narrow); the filter of the shadow is 9 x 9; of the 32 lights each is 0.7 times as
 bright as the one before, or all are as bright; 60 lamps stand near the floor; of the eight
 sources some show next to nothing new. With each plan is written what it cost to find, in
-seconds and in renderings of the effect, before and after its programs were compiled.
+seconds and in renderings of the effect, before and after its programs were compiled. The walk
+of one source's rays in as many steps as they need, and in fewer, tells why steps are not
+planned.
 """
 
 import functools
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import relight_scenes
@@ -27,7 +30,10 @@ from jaxfx import (
     scene,
     shadow,
 )
+from jaxfx._sampling import pixel_centers
 from jaxfx.dof.scatter import largest_coc
+from jaxfx.reproject._rays import view_rays
+from jaxfx.reproject._search import search
 
 
 SIZE, ERROR = (384, 512), 1e-2
@@ -64,42 +70,23 @@ def of_shadow():
     return full, functools.partial(budget.shadow, **how, max_error=ERROR), data
 
 
-def of_lights(ratio):
+def of_lights(lights):
     gbuffer, camera, _ = lit()
-    lights = [
-        type(light)(
-            light.position, light.color * (8 if ratio < 1 else 1) * np.float32(ratio**n)
-        )
-        for n, light in enumerate(relight_scenes.lights(32))
-    ]
-    return (
-        relight.render,
-        functools.partial(budget.relight, max_error=ERROR),
-        (
-            gbuffer,
-            camera,
-            lights,
-        ),
-    )
+    plan = functools.partial(budget.relight, max_error=ERROR)
+    return relight.render, plan, (gbuffer, camera, lights)
 
 
-def of_lamps():
-    gbuffer, camera, _ = lit()
+def lights(ratio):
+    bright = lambda n: np.float32((8 if ratio < 1 else 1) * ratio**n)
+    of_32 = enumerate(relight_scenes.lights(32))
+    return [PointLight(light.position, light.color * bright(n)) for n, light in of_32]
+
+
+def lamps():
     low, high = relight_scenes.view((48, 64))[0].bounds
     places = np.random.default_rng(0).uniform(low[[0, 2]], high[[0, 2]], (60, 2))
-    lamp = lambda x, z: PointLight(
-        np.array([x, low[1] + 0.15, z], np.float32), np.full(3, 0.05, np.float32)
-    )
-    lights = [lamp(*place) for place in places]
-    return (
-        relight.render,
-        functools.partial(budget.relight, max_error=ERROR),
-        (
-            gbuffer,
-            camera,
-            lights,
-        ),
-    )
+    dim = np.full(3, 0.05, np.float32)
+    return [PointLight(np.array([x, low[1] + 0.15, z], np.float32), dim) for x, z in places]
 
 
 def of_sources():
@@ -113,9 +100,9 @@ CASES = {
     "wide lens": functools.partial(of_lens, 0.12),
     "narrow lens": functools.partial(of_lens, 0.06),
     "shadow": of_shadow,
-    "unequal lights": functools.partial(of_lights, 0.7),
-    "equal lights": functools.partial(of_lights, 1.0),
-    "lamps": of_lamps,
+    "unequal lights": lambda: of_lights(lights(0.7)),
+    "equal lights": lambda: of_lights(lights(1.0)),
+    "lamps": lambda: of_lights(lamps()),
     "sources": of_sources,
 }
 
@@ -124,11 +111,12 @@ CASES = {
 def case(name):
     full, plan, data = CASES[name]()
     seconds = []
-    for _ in range(2):
+    for _ in range(4):
         started = time.perf_counter()
         found = plan(*data)
         seconds.append(time.perf_counter() - started)
-    return full, found, data, seconds
+    # By what time decides, another way may be measured than at first, and compiled.
+    return full, found, data, (seconds[0], min(seconds[1:]))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -150,3 +138,19 @@ def test_plan(benchmark, name, which):
             "found in renderings": [one / rendering for one in seconds],
         }
         print(plan, f"found in {seconds} s, a rendering is {rendering:.3g} s", sep="\n")
+
+
+@pytest.mark.parametrize("most", [None, 16, 24, 32])
+def test_steps(benchmark, most):
+    benchmark.group = "steps"
+    target, _, caches, cameras = relight_scenes.new_view(SIZE, 2)
+    depth, pixels = caches[1].depth, pixel_centers(*SIZE, jnp.float32).reshape(-1, 2)
+    rays = view_rays(cameras[1], target, pixels, shape=SIZE, near=jnp.min(depth) / 2)
+    walk = jax.jit(search, static_argnums=(3, 4))
+    data = -1 / depth, rays.origin, rays.direction, "pyramid", most
+    run = lambda: jax.block_until_ready(walk(*data))
+    found = benchmark.pedantic(run, rounds=7, warmup_rounds=1)
+    taken, cut = int(found.steps.max()), float(jnp.mean(found.exhausted))
+    benchmark.extra_info |= {"most steps taken": taken, "share of rays cut short": cut}
+    print(f"at most {most}: {taken} steps, {cut:.1%} of the rays cut short")
+    assert (cut > 0) == (most is not None)

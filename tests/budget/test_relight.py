@@ -45,7 +45,8 @@ def scene(rng):
 def plans(promised):
     """Of pictures just large enough that merged lights are tried in some of their pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importlib.import_module("jaxfx.budget.relight"), "_MANY", 128)
+        for name, value in {"_EVERY": 4, "_MANY": 128}.items():
+            patch.setattr(importlib.import_module("jaxfx.budget.relight"), name, value)
         return promised(scene, budget.relight, relight.render, (-3, -1))
 
 
