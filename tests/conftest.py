@@ -3,6 +3,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from quick import quickly
 
 
 jax.config.update("jax_enable_x64", True)
@@ -23,3 +24,11 @@ def forget_programs():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
         jax.clear_caches()
+
+
+@pytest.fixture
+def quick():
+    """What a test compiles is compiled with little optimisation, in half to three quarters of
+    the time. (`tests/test_transforms.py` compares every function with and without it.)"""
+    with quickly():
+        yield

@@ -1,7 +1,8 @@
 """Programs that are quick to compile, for what is asked of neither speed nor memory."""
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -17,6 +18,16 @@ quick_jit = functools.partial(
         "xla_cpu_use_fusion_emitters": False,
     },
 )
+
+
+@contextlib.contextmanager
+def quickly() -> Iterator[None]:
+    """What is compiled meanwhile, within calls too, is compiled with little optimisation."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", False)
 
 
 def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: float) -> None:

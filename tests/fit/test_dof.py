@@ -89,6 +89,7 @@ def test_recovers_what_made_the_picture(sides, dtype):
     assert len(fitted.losses) < 80
 
 
+@pytest.mark.usefixtures("quick")
 def test_the_threshold_of_layered_scatter_is_found():
     image, depth = still_life(16)
     lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 40.0)
@@ -114,12 +115,14 @@ def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
     np.testing.assert_allclose(fitted.image, again, atol=1e-12)
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_search_that_runs_out_of_room_goes_on_with_more():
     fitted = quietly(*picture(), wrong((0, 0, 1, 1)), max_coc=None)
     assert fitted.success and fitted.clamped == 0
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
 
 
+@pytest.mark.usefixtures("quick")
 def test_says_what_was_clamped():
     reference, image, depth = picture()
     fitted = quietly(reference, image, depth, parameters=("gamma",), max_coc=3.5)
@@ -128,6 +131,7 @@ def test_says_what_was_clamped():
     assert fitted.clamped == pytest.approx(share)
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     "free", [("aperture", "focus_distance"), ("epsilon", "gamma")], ids="-".join
 )
@@ -142,6 +146,7 @@ def test_what_is_frozen_stays(free):
 TOLERANCE = {"rtol": 1e-6, "atol": 1e-8}
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     "solver",
     [
@@ -182,6 +187,7 @@ def behind_the_focus():
     return reference + noise, image, depth, values
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_solver_that_breaks_down_leaves_what_it_had():
     # Without damping, a parameter without a derivative is a division by zero.
     reference, image, depth, values = behind_the_focus()
@@ -191,6 +197,7 @@ def test_a_solver_that_breaks_down_leaves_what_it_had():
     assert found(fitted) == pytest.approx(values)
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_the_picture_cannot_tell_is_uncertain():
     fitted = quietly(*behind_the_focus())
     assert fitted.uncertainty["gamma"] == fitted.uncertainty["epsilon"] == np.inf

@@ -105,6 +105,7 @@ def test_recovers_three_lights(start):
     assert_recovers(TRUTH, start, np.float64)
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("start", WRONG, ids=["far", "near"])
 def test_recovers_in_float32(start):
     assert_recovers(TRUTH[1:2], start[1:2], np.float32)
@@ -129,6 +130,7 @@ def test_brightness_does_not_matter():
     np.testing.assert_allclose(fitted.losses[-1], 0, atol=1e-14)
 
 
+@pytest.mark.usefixtures("quick")
 def test_what_is_frozen_stays():
     truth = TRUTH[1:]
     wrong = {"direction": WRONG[0][2].direction, "outer_angle": jnp.array(0.65)}
@@ -158,6 +160,7 @@ SUNS = (
 )
 
 
+@pytest.mark.usefixtures("quick")
 def test_colors_alone_are_a_linear_problem():
     """By NumPy's least squares, of a reference that no lights explain."""
     rng = np.random.default_rng(0)
@@ -199,6 +202,7 @@ DEPENDENT = {
 }
 
 
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("made", "lights", "groups"), DEPENDENT.values(), ids=DEPENDENT)
 def test_lights_that_cannot_be_told_apart(made, lights, groups):
     reference = relight.render(made(), CAMERA, lights)
@@ -211,6 +215,7 @@ def test_lights_that_cannot_be_told_apart(made, lights, groups):
             np.testing.assert_allclose(fitted.lights[one].color, fitted.lights[other].color)
 
 
+@pytest.mark.usefixtures("quick")
 def test_suns_over_a_matt_hill_are_dependent_but_for_three():
     """What is lit everywhere and has no highlight sees the sum of the suns alone."""
     hill = cache()

@@ -20,6 +20,8 @@ from jaxfx import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SIZE, SCALE = 48, 12.0
 PLANE, PLATE, HALF = 4.0, 2.5, 0.5
 

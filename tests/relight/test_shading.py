@@ -22,6 +22,8 @@ from jaxfx import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SHADERS = {"lambert": 0, "phong": 1, "blinn": 2}
 LIGHTS = {
     "ambient": AmbientLight([0.3, 0.2, 0.1]),

@@ -22,6 +22,8 @@ from jaxfx import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 SIZE = (7, 9)
 CAMERA = PinholeCamera.from_fov(0.9, height=SIZE[0], width=SIZE[1])
 

@@ -28,6 +28,8 @@ from relight_views import (
 from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 FLOATS = ("color", "ambient", "diffuse", "specular", "roughness", "normal")
 
 

@@ -10,6 +10,9 @@ from jaxfx import PinholeCamera
 from jaxfx.reproject import blend, choose, warp
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
+
 def camera(x=0.0, turn=0.0, height=16, width=24):
     pose = np.eye(4)
     c, s = np.cos(turn), np.sin(turn)

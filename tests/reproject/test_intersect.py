@@ -15,6 +15,8 @@ from reproject_failures import awkward_rays, field, grid_walk
 from jaxfx.reproject import _walk, intersect
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 METHODS = ("pyramid", "descent", "linear", "relief")
 
 

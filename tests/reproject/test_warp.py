@@ -14,6 +14,9 @@ from jaxfx import OrthographicCamera, PinholeCamera, scene
 from jaxfx.reproject import warp
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
+
 def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
     pose = np.eye(4)
     c, s = np.cos(turn), np.sin(turn)

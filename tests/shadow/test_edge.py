@@ -21,6 +21,9 @@ from jaxfx.shadow.edge import usual_dilation
 from .conftest import naive_pcf, random_case
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
+
 def steps_case(seed, dtype=np.float32):
     """A map of a few flat depths with single texels among them: windows that agree exist."""
     rng = np.random.default_rng(seed)

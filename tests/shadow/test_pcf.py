@@ -13,6 +13,8 @@ from jaxfx import shadow
 from .conftest import naive_pcf, random_case
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 KERNELS = ("box", "tent", "gaussian")
 
 

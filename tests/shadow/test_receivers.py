@@ -12,6 +12,8 @@ from jaxfx import OrthographicCamera, PinholeCamera, shadow
 from jaxfx._sampling import pixel_centers
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 HEIGHT, WIDTH = 6, 7
 
 
