@@ -35,7 +35,7 @@ BLOCK = (64, 64)
 CHUNK, BRIGHT_CHUNK = 1024, 16
 # At most so many slices lie to either side of the focus.
 SLICES = 128
-# How many slices later those of the next sheet are.
+# At most so many slices later are those of the next sheet.
 APART = 2 * SLICES + 2
 
 
@@ -57,7 +57,8 @@ class Sheets(NamedTuple):
 
 def ordered(place: Float[Array, "sheet height width"]) -> Float[Array, "sheet height width"]:
     """The places of all sheets, one sheet after the other."""
-    return place + APART * jnp.arange(len(place), dtype=place.dtype)[:, None, None]
+    apart = jax.lax.stop_gradient(jnp.ceil(place.max()) - jnp.floor(place.min()) + 2)
+    return place + apart * jnp.arange(len(place), dtype=place.dtype)[:, None, None]
 
 
 def share_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
