@@ -14,6 +14,9 @@ from jax.test_util import check_grads
 from jaxfx import OrthographicCamera, PinholeCamera
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
+
 def rigid(rng):
     """A random pose: a right-handed rotation and a translation."""
     axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))

@@ -9,6 +9,9 @@ import scipy.ndimage
 from jaxfx import _filter
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
+
 def along(size, weights):
     """The matrix of one axis: SciPy's filter of every unit vector."""
     return scipy.ndimage.correlate1d(np.eye(size), weights, axis=0, mode="nearest")

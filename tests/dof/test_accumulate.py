@@ -14,6 +14,8 @@ from jaxfx._sampling import pixel_centers
 from jaxfx.dof.accumulate import lens_samples
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 HEIGHT, WIDTH = 8, 24
 FOCUS = 2.0
 CAMERA = PinholeCamera.from_fov(0.8, height=HEIGHT, width=WIDTH)

@@ -13,6 +13,8 @@ from jaxfx import FocusPlanes, ThinLens, dof, metrics
 from jaxfx.dof.accumulate import lens_samples
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 LENSES = [ThinLens(0.1, 2.5, 60.0), FocusPlanes(1.0, 2.5, 6.0, 5.0)]
 
 

@@ -11,6 +11,8 @@ import pytest
 from jaxfx import FocusPlanes, ThinLens, dof
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
 METHODS = [dof.anisotropic_diffusion, dof.implicit_diffusion]
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.__name__)
 LENSES = [ThinLens(0.3, 3.0, 60.0), FocusPlanes(1.0, 3.0, 8.0, 9.0)]

@@ -13,6 +13,9 @@ from jaxfx.dof._discs import vogel
 from jaxfx.dof.gather import low_resolution
 
 
+pytestmark = pytest.mark.usefixtures("quick")
+
+
 # Of the paper, once more: these are what it prints.
 POISSON = [
     (0.0, 0.0),
