@@ -20,6 +20,12 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
+# What is said of the standard errors.
+IF_NOISE = """\
+if noise: the standard errors, if all that is left were noise. They are too small: derivatives
+miss silhouettes, and the model misses what the mesh alone has (--of-mesh)"""
+
+
 def parsed(parser: argparse.ArgumentParser, least: Mapping[str, float]) -> Any:
     """The arguments, no number of them below what is the least."""
     arguments = parser.parse_args()

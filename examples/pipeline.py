@@ -7,8 +7,8 @@ in 13 numbers: the camera's eye and turn, the key light's direction and color, t
 aperture and focus distance. Levenberg-Marquardt finds all of them from a noisy picture that the
 same function made. From one of the mesh itself (`--of-mesh`), which is sharper than what is
 read between a frame buffer's pixels, it finds camera and light, and not the lens. Prints the
-time of every stage and what is left of the errors; writes `stages.png`, `derivatives.png`,
-`fit.png` and `report.json`.
+time of every stage, what is left of the errors, and what noise alone would leave; writes
+`stages.png`, `derivatives.png`, `fit.png` and `report.json`.
 """
 
 import argparse
@@ -376,7 +376,7 @@ def main() -> None:
     errors = {"start": sizes(starts[0] - truth, truth)}
     errors |= {name: sizes(values - truth, truth) for name, (values, *_) in found.items()}
     deviations, hardest = expected(covariance)
-    errors["std. error"] = sizes(deviations, truth)
+    errors["if noise"] = sizes(deviations, truth)
     slope = 2 * _pipeline.equations(image, jacobian)[1]
     apart = np.max(np.abs(given["gradient, reverse"] - slope)) / np.max(np.abs(slope))
     report = {
@@ -392,7 +392,7 @@ def main() -> None:
     _pipeline.print_table(errors)
     for name, went in report["searches"].items():
         print(name + ", ".join(f" {key} {value:.3g}" for key, value in went.items()))
-    print(f"hardest to tell apart: {hardest}")
+    print(f"hardest to tell apart: {hardest}\n{_pipeline.IF_NOISE}")
     print(f"pictures and report in {out}")
 
 

@@ -44,7 +44,8 @@ def plans(promised):
 
     random = lambda rng: scene(rng, rng.choice(list(sizes), p=[0.2, 0.8]), (32, 40))
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"_SIDE": 8, "_PARTS": 3, "_MOST": 16}.items():
+        fewer = {"_SIDE": 8, "_PARTS": 3, "_MOST": 16, "_OTHERS": ("separable",)}
+        for name, value in fewer.items():
             patch.setattr(importlib.import_module("jaxfx.budget.dof"), name, value)
         return promised(random, budget.dof, full, (-3, -1))
 
