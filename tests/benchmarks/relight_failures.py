@@ -406,6 +406,6 @@ def exr_files(method):
 not_measured(
     "relight",
     "EXR in Blender",
-    "There is no figure to it: Blender finds every pass under its name and to the bit, or a test"
-    " in tests/exr fails. It is skipped where Blender is not installed.",
+    "There is no figure to it: Blender finds every pass under its name and to the bit, or a"
+    " test in tests/exr fails. It is skipped where Blender is not installed.",
 )
