@@ -6,9 +6,12 @@ fills it all. A sprite between two slices is divided. The slices of a sheet come
 the sheet before: its sprites are hidden to the centre of the lens, and what is not is known
 better.
 
-The adjoint needs no slice kept. Of a pixel it knows the slice that filled it, the share that
-this one got, and its colour: slices in front count in full and, by the room they take, against
-that colour.
+What is left free has the mean colour of what arrived, which counts for more the more was filled
+before it.
+
+The adjoint keeps no slice but paints each once more. Of a pixel it knows the slice that filled
+it, the share that this one got, and its colour: slices in front count in full and, by the room
+they take, against that colour.
 """
 
 from typing import NamedTuple
