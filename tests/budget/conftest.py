@@ -4,8 +4,16 @@ import statistics
 
 import numpy as np
 import pytest
+from quick import quickly
 
 from jaxfx.budget import _plan
+
+
+@pytest.fixture(autouse=True, scope="package")
+def compiled_quickly():
+    """Plans of small scenes are made here, and none is asked how fast it is."""
+    with quickly():
+        yield
 
 
 class Promises(list):
