@@ -71,6 +71,7 @@ def share_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 def share_slope_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The derivative of `share_of`."""
     t = clip01(jnp.abs(beyond))
     return -6 * jnp.sign(beyond) * t * (1 - t)
 
