@@ -20,8 +20,9 @@ from jaxfx._numerics import is_concrete
 _ROOMS = (1.25, 1.0, 0.75)
 # A way that takes so many times as long as the effect is not drawn on further parts.
 _SLOW = 1.5
-# The programs that were called before, and so are compiled.
-_called: set[int] = set()
+# The programs that were called before, and so are compiled. Kept whole: the hash of a structure
+# does not tell static fields apart.
+_called: set[Any] = set()
 
 
 @final
@@ -156,7 +157,7 @@ def timed(call: Any, data: Sequence[Any]) -> tuple[Any, float]:
     """The picture that a call gives, and the seconds it takes once it is compiled."""
     leaves, structure = jax.tree.flatten((call, data))
     kinds = [(np.shape(leaf), getattr(leaf, "dtype", leaf)) for leaf in leaves]
-    program = hash((structure, *kinds))
+    program = (structure, *kinds)
     if program not in _called:
         jax.block_until_ready(call(*data))
         _called.add(program)

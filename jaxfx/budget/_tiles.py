@@ -36,14 +36,25 @@ class Blocks(eqx.Module):
     pixels: Int[Array, "block pixel"]
 
 
-def blocks(uses: Bool[np.ndarray, "item pixel"], items: Sequence[Any]) -> tuple[Blocks, ...]:
-    """The pixels that each item is used for."""
+def blocks(
+    uses: Bool[np.ndarray, "item pixel"],
+    items: Sequence[Any],
+    cost: Int[np.ndarray, "item pixel"] | None = None,
+) -> tuple[Blocks, ...]:
+    """The pixels that each item is used for, those of like cost in one block.
+
+    A block takes as long as the dearest of its pixels.
+    """
     kinds: dict[str, list[int]] = {}
     for index in np.flatnonzero(uses.any(axis=1)).tolist():
         kinds.setdefault(str(jax.tree.map(jax.typeof, items[index])), []).append(index)
     size, found = min(_BLOCK, uses.shape[1]), []
     for members in kinds.values():
         wanted = [np.flatnonzero(uses[index]) for index in members]
+        if cost is not None:
+            ranks = [cost[index, pixels] for index, pixels in zip(members, wanted, strict=True)]
+            order = [np.argsort(rank, kind="stable") for rank in ranks]
+            wanted = [pixels[first] for pixels, first in zip(wanted, order, strict=True)]
         filled = [
             np.pad(pixels, (0, -len(pixels) % size), constant_values=uses.shape[1])
             for pixels in wanted
@@ -94,7 +105,12 @@ def spend(
     # A step waits for the dearest before it: so the steps of a tile are taken in order.
     order = np.argsort(np.maximum.accumulate(price, axis=1).ravel(), kind="stable")
     spent = np.maximum.accumulate(np.cumsum(price.ravel()[order]))
-    steps = np.searchsorted(spent, (_SPENT * max_error) ** 2 * size, side="right")
+    steps = np.searchsorted(spent, allowed(max_error, size), side="right")
     taken = np.zeros(price.size, bool)
     taken[order[:steps]] = True
     return taken.reshape(price.shape).sum(axis=1)
+
+
+def allowed(max_error: float, size: int) -> float:
+    """The sum of squared errors that a picture of so many numbers may have."""
+    return (_SPENT * max_error) ** 2 * size

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
-from jaxfx.budget._tiles import Blocks, blocks, spend, sums, tile_of
+from jaxfx.budget._tiles import Blocks, allowed, blocks, spend, sums, tile_of
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.reproject.blend import Sight, blend
 
@@ -21,16 +21,22 @@ from jaxfx.reproject.blend import Sight, blend
 _OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
 # What a pixel that nobody shows any more adds to the squared error: coverage is kept.
 _LOST = 1e30
+# The bounds on a ray's steps that are weighed: so many equal parts of the most that one takes.
+_BOUNDS = 8
 
 
 class Seen(NamedTuple):
-    """What rays show: for which pixel each is, its colour, whether, how straight, how far."""
+    """What rays show: for which pixel each is, its colour, whether, how straight, how far.
+
+    And after how many steps.
+    """
 
     pixel: Int[Array, " ray"]
     color: Float[Array, "ray channel"]
     mask: Bool[Array, " ray"]
     along: Float[Array, " ray"]
     z: Float[Array, " ray"]
+    steps: Int[Array, " ray"]
 
 
 class Everything(eqx.Module):
@@ -45,15 +51,17 @@ class Everything(eqx.Module):
 
 
 class Blend(eqx.Module):
-    """`reproject.blend`, of each source in some tiles only."""
+    """`reproject.blend`, of each source in some tiles only, and each ray in few steps."""
 
     parts: tuple[Blocks, ...]
     shape: tuple[int, int] = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True, default=None)
     title: ClassVar[str] = "reprojection, tile by tile"
 
     def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
         """As the effect."""
-        seen = _seen(_chosen(self.parts, images, depths, sources), target, self.shape)
+        parts = _chosen(self.parts, images, depths, sources)
+        seen = _seen(parts, target, self.shape, self.max_steps)
         color, known = _blended(seen, self.shape[0] * self.shape[1])
         known = known.astype(color.dtype)
         return color.reshape(*self.shape, -1), known.reshape(self.shape)
@@ -73,10 +81,10 @@ def reproject(
     The effect is drawn once, each source apart. In every tile of 8 x 8 pixels the sources are
     left out one after another, from the one that has the least share on, for as long as every
     pixel that was known is known; over the whole picture those first that cost the least error.
-    What is left is drawn and measured against the effect.
-
-    Rays take as many steps as they need. A bound on them is not planned: the most that any ray
-    takes saves nothing, and one that saves 7 % of a walk cuts 5 % of its rays short.
+    Rays of like length are traversed together, as a block takes the steps of its longest; and
+    what error is left goes to the least bound on steps, of eight, by which every pixel is still
+    known: a ray that needs more shows nothing. What is left is drawn and measured against the
+    effect.
 
     It costs two renderings of all sources, one for the proof and one apart, and one by the
     plan.
@@ -102,12 +110,18 @@ def reproject(
     search = Search(Everything(shape), data, max_error)
     height, width = search.whole[1].shape[:2]
     size = (height, width)
-    uses = _uses(*data, size, max_error)
+    uses, steps, most = _needed(*data, size, max_error)
+    texts = []
     if not uses.all():
         idle = ", ".join(str(index) for index in np.flatnonzero(~uses.any(axis=1)))
-        text = f"{1 - uses.mean():.0%} of the rays{', all of sources ' if idle else ''}{idle}"
-        parts = blocks(uses, list(zip(images, depths, sources, strict=True)))
-        search.trial(Blend(parts, size), f"{text}, where others show next to the same")
+        texts.append(f"{1 - uses.mean():.0%} of the rays{', all of sources ' if idle else ''}")
+        texts[-1] += f"{idle}, where others show next to the same"
+    if most is not None:
+        longer = np.mean(steps[uses] > most)
+        texts.append(f"steps of a ray after {most}, which {longer:.2g} of the rays would take")
+    if texts and uses.any():
+        parts = blocks(uses, list(zip(images, depths, sources, strict=True)), steps)
+        search.trial(Blend(parts, size, most), "; ".join(texts))
     return search.plan()
 
 
@@ -125,31 +139,43 @@ def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> 
     return [([source(n) for n in part.members], part.item, part.pixels) for part in parts]
 
 
-def _uses(
+def _needed(
     images: Any, depths: Any, sources: Any, target: Any, size: tuple[int, int], max_error: float
-) -> Bool[np.ndarray, "source pixel"]:
-    """Which sources to look at for each pixel."""
+) -> tuple[Bool[np.ndarray, "source pixel"], Int[np.ndarray, "source pixel"], int | None]:
+    """Which sources to look at for each pixel, the steps of that, and the most to be taken."""
     tile, count = tile_of(size), len(sources)
     everything = np.ones((count, size[0] * size[1]), bool)
     parts = blocks(everything, list(zip(images, depths, sources, strict=True)))
-    seen = _seen(_chosen(parts, images, depths, sources), target, size)
+    seen = _seen(_chosen(parts, images, depths, sources), target, size, None)
     weights = _weights(seen, everything.shape[1])
     source = np.concatenate(
         [np.repeat(np.array(p.members)[np.asarray(p.item)], p.pixels.shape[1]) for p in parts]
     )
+    # A ray that is there to fill a block is for the pixel after the last.
     shares = np.zeros((count, everything.shape[1] + 1))
-    np.add.at(shares, (source, np.asarray(seen.pixel)), np.asarray(weights, float))
+    steps = np.zeros(shares.shape, np.int32)
+    shares[source, seen.pixel], steps[source, seen.pixel] = weights, seen.steps
     # The place of each source in its tile, the one with the largest share first.
     place = np.argsort(np.argsort(-sums(shares[:, :-1], tile), axis=1), axis=1)
-    own = place[np.append(tile, 0)[np.asarray(seen.pixel)], source]
-    squares = _squares(seen, jnp.asarray(own), jnp.arange(count, -1, -1), size)
-    kept = count - spend(sums(squares, tile), max_error, squares.shape[1] * images[0].shape[2])
-    return (place < kept[:, None])[tile].T
+    tile_of_ray = np.append(tile, 0)[seen.pixel]
+    own = place[tile_of_ray, source]
+    squares = _squares(seen, own, np.arange(count, -1, -1), size)
+    numbers = squares.shape[1] * images[0].shape[2]
+    kept = count - spend(sums(squares, tile), max_error, numbers)
+    uses, steps = (place < kept[:, None])[tile].T, steps[:, :-1]
+
+    most = np.max(steps, where=uses, initial=0)
+    bounds = np.unique(np.arange(1, _BOUNDS) * most // _BOUNDS)
+    needed = np.where(own < kept[tile_of_ray], seen.steps, np.iinfo(np.int32).max)
+    squares = _squares(seen, needed, bounds + 1, size)
+    enough = bounds[(bounds > 0) & (squares.sum(axis=1) <= allowed(max_error, numbers))]
+    return uses, steps, enough.min().item() if enough.size else None
 
 
 @eqx.filter_jit
-def _seen(parts: list[Any], target: Any, size: tuple[int, int]) -> Seen:
+def _seen(parts: list[Any], target: Any, size: tuple[int, int], max_steps: int | None) -> Seen:
     """What all rays show, block after block."""
+    options = _OPTIONS | {"max_steps": max_steps}
     points, found = pixel_centers(*size).reshape(-1, 2), []
     for members, *of_each in parts:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
@@ -157,9 +183,10 @@ def _seen(parts: list[Any], target: Any, size: tuple[int, int]) -> Seen:
         def block(each, stacked=stacked):
             source, pixels = each
             image, depth, camera = jax.tree.map(lambda x: x[source], stacked)
-            rays = Sight(target, points.at[pixels].get(mode="clip"), _OPTIONS)
+            rays = Sight(target, points.at[pixels].get(mode="clip"), options)
             view, along, z = rays(depth, camera)
-            return Seen(pixels, view.patch.read_colors(image), view.mask, along, z)
+            color = view.patch.read_colors(image)
+            return Seen(pixels, color, view.mask, along, z, view.steps)
 
         rays = jax.lax.map(block, tuple(of_each))
         found.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays))
@@ -188,10 +215,16 @@ def _blended(seen: Seen, count: int) -> tuple[Float[Array, "pixel channel"], Arr
     return safe_divide(both[:, :-1], weights), weights[:, 0] > 0
 
 
+def _squares(
+    seen: Seen, place: np.ndarray, kept: np.ndarray, size: tuple[int, int]
+) -> Float[np.ndarray, "level pixel"]:
+    """For every number of places that is kept, the squared error that each pixel makes."""
+    place, kept = jnp.asarray(place, jnp.int32), jnp.asarray(kept, jnp.int32)
+    return np.asarray(_errors(seen, place, kept, size[0] * size[1]), np.float64)
+
+
 @eqx.filter_jit
-def _squares(seen: Seen, place: Array, kept: Array, size: tuple[int, int]) -> Array:
-    """For every number of sources that is kept, the squared error that each pixel makes."""
-    count = size[0] * size[1]
+def _errors(seen: Seen, place: Array, kept: Array, count: int) -> Array:
     color, known = _blended(seen, count)
 
     def square(kept):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._numerics import safe_divide
 from jaxfx.camera import PinholeCamera
@@ -19,13 +19,14 @@ from jaxfx.reproject._surface import bilinear_point
 class View(NamedTuple):
     """For each of the target's pixels: what it shows of the source, and whether it does.
 
-    Where it shows nothing, no texel of the patch has a share.
+    Where it shows nothing, no texel of the patch has a share. With it, how long the search was.
     """
 
     pixels: Float[Array, "ray 2"]
     inverse_depth: Float[Array, " ray"]
     mask: Bool[Array, " ray"]
     patch: Patch
+    steps: Int[Array, " ray"]
 
 
 @eqx.filter_jit
@@ -37,6 +38,7 @@ def look(
     *,
     method: str,
     hole_threshold: int | float,
+    max_steps: int | None = None,
 ) -> View:
     """The source's pixels that some of the target's pixels see, and 1 / z in the source."""
     height, width = depth.shape
@@ -46,7 +48,7 @@ def look(
     nearest = jax.lax.stop_gradient(jnp.min(jnp.where(known, depth, jnp.inf)))
     near = jnp.where(nearest < jnp.inf, nearest / 2, 1)
     rays = view_rays(source, target, pixels, shape=(height, width), near=near)
-    found = search(field, rays.origin, rays.direction, method, None)
+    found = search(field, rays.origin, rays.direction, method, max_steps)
     # A ray that ends at infinity meets what lies there, and nothing beyond.
     ends = found.time <= 1 + 64 * jnp.finfo(depth.dtype).eps
     found = found._replace(mask=found.mask & rays.inside & ends)
@@ -59,7 +61,7 @@ def look(
     seen = found.mask & ~unseen
     shown = patch(field, x, y, anchor, hole_threshold)
     shown = shown._replace(shares=jnp.where(seen[None], shown.shares, 0))
-    return View(jnp.stack([x, y], axis=-1), -z, seen, shown)
+    return View(jnp.stack([x, y], axis=-1), -z, seen, shown, found.steps)
 
 
 def _is_unseen(

@@ -2,10 +2,11 @@
 
 import time
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfx.budget._plan import Part, Search
+from jaxfx.budget._plan import Part, Search, timed
 from jaxfx.budget._tiles import spend, sums, tile_of
 
 
@@ -47,6 +48,21 @@ def test_what_is_slower_than_the_effect_is_not_taken():
     plan = search(Way(slice(1), 0.01, 0.03))
     assert plan.predicted_error == 0
     assert "not taken: number 0: takes" in str(plan)
+
+
+def test_every_way_is_called_once_before_it_is_timed_whatever_its_static_fields():
+    called = []
+
+    class Steps(eqx.Module):
+        most: int = eqx.field(static=True)
+
+        def __call__(self, picture):
+            called.append(self.most)
+            return picture
+
+    for most in (1, 2, 2):
+        timed(Steps(most), (jnp.ones(3),))
+    assert called == [1, 1, 2, 2, 2]
 
 
 def test_tiles_hold_their_own_pixels_and_no_others():
