@@ -75,16 +75,17 @@ def bilinear_point(
     reach = jnp.where(per_texel > 0, _REACH / jnp.where(per_texel > 0, per_texel, 1), jnp.inf)
     low, high = jnp.maximum(found.time - reach, 0), found.time + reach
 
-    def newton(_, state):
-        time, _ = state
+    def newton(step, state):
+        time, last, _ = state
         value, slope = along(time)
         move = -value / jnp.where(slope > 0, slope, 1)
-        new = jnp.where(slope > 0, jnp.clip(time + move, low, high), time)
-        return new, jnp.where(slope > 0, jnp.abs(move), jnp.inf)
+        moves = (slope > 0) & (step < _NEWTON)
+        last = jnp.where(moves, jnp.abs(move), jnp.where(step < _NEWTON, jnp.inf, last))
+        return jnp.where(moves, jnp.clip(time + move, low, high), time), last, slope
 
-    start = found.time, jnp.full_like(found.time, jnp.inf)
-    time, last = jax.lax.fori_loop(0, _NEWTON, newton, start)
-    _, slope = along(time)
+    # Once more for the slope: what the loop gives is in memory, and no reader computes it anew.
+    start = found.time, jnp.full_like(found.time, jnp.inf), jnp.ones_like(found.time)
+    time, last, slope = jax.lax.fori_loop(0, _NEWTON + 1, newton, start)
     terms = jnp.abs(d[:, 2]) + jnp.abs(slope - d[:, 2])
     steep = slope > _GRAZING * terms
     arrived = steep & (last * per_texel < _ARRIVED) & found.mask
@@ -98,7 +99,17 @@ def bilinear_point(
 
 def _differentiable(origin, direction, time, miss, slope, known, grazing) -> Point:
     """The position at a held time that follows the arguments, where `known`."""
-    hold = jax.lax.stop_gradient
-    miss = jnp.where(known, miss, 0)
-    time = hold(time) - (miss - hold(miss)) / hold(jnp.where(known, slope, 1))
+    time = _at_zero(time, jnp.where(known, miss, 0), jnp.where(known, slope, 1))
     return Point(origin + time[:, None] * direction, grazing)
+
+
+@jax.custom_jvp
+def _at_zero(time: Array, miss: Array, slope: Array) -> Array:
+    """The time at which `miss` is 0, that it grows from by `slope`. No miss is computed."""
+    return time
+
+
+@_at_zero.defjvp
+def _at_zero_jvp(primals, tangents):
+    time, _, slope = primals
+    return time, -tangents[1] / slope
