@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 # The side of a tile, in pixels: a larger one needs more, a smaller one takes more counting.
 _SIDE = 8
-# Pixels of a block; fewer would not fill a core.
-_BLOCK = 4096
+# Pixels of a block, at the least: fewer would not fill a core. And blocks of a picture, at the
+# most: each looks at its item anew, be it as large as the picture.
+_BLOCK, _BLOCKS = 4096, 24
 # A plan's own picture may round a little otherwise than what it was chosen by.
 _SPENT = 0.999
 
@@ -48,7 +49,7 @@ def blocks(
     kinds: dict[str, list[int]] = {}
     for index in np.flatnonzero(uses.any(axis=1)).tolist():
         kinds.setdefault(str(jax.tree.map(jax.typeof, items[index])), []).append(index)
-    size, found = min(_BLOCK, uses.shape[1]), []
+    size, found = min(max(_BLOCK, uses.shape[1] // _BLOCKS), uses.shape[1]), []
     for members in kinds.values():
         wanted = [np.flatnonzero(uses[index]) for index in members]
         if cost is not None:

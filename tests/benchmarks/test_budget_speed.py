@@ -5,14 +5,16 @@ ratio of the full effect to its plan at an error of 1e-2. The lens has circles u
 (wide) or 25 (narrow); the filter of the shadow is 9 x 9; of the 32 lights each is 0.7 times as
 bright as the one before, or all are as bright; 60 lamps stand near the floor; of the eight
 sources some show next to nothing new. With each plan is written what it cost to find, in
-seconds and in renderings of the effect, before and after its programs were compiled. The walk
-of one source's rays in as many steps as they need, and in fewer, tells why steps are not
-planned.
+seconds and in renderings of the effect, before and after its programs were compiled. The plan
+of sources is also drawn without its bound on a ray's steps, and without rays of like length
+together.
 """
 
+import dataclasses
 import functools
 import time
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,10 +32,7 @@ from jaxfx import (
     scene,
     shadow,
 )
-from jaxfx._sampling import pixel_centers
 from jaxfx.dof.scatter import largest_coc
-from jaxfx.reproject._rays import view_rays
-from jaxfx.reproject._search import search
 
 
 SIZE, ERROR = (384, 512), 1e-2
@@ -140,17 +139,23 @@ def test_plan(benchmark, name, which):
         print(plan, f"found in {seconds} s, a rendering is {rendering:.3g} s", sep="\n")
 
 
-@pytest.mark.parametrize("most", [None, 16, 24, 32])
-def test_steps(benchmark, most):
+def in_rows(part):
+    """The blocks of a plan, each source's pixels row by row, and not by the steps they take."""
+    pixels, item = np.asarray(part.pixels), np.asarray(part.item)
+    rows = [np.sort(pixels[item == one], axis=None) for one in np.unique(item)]
+    rows = jnp.asarray(np.concatenate(rows).reshape(pixels.shape))
+    return eqx.tree_at(lambda blocks: blocks.pixels, part, rows)
+
+
+@pytest.mark.parametrize("which", ["planned", "no bound", "nor by length"])
+def test_steps(benchmark, which):
     benchmark.group = "steps"
-    target, _, caches, cameras = relight_scenes.new_view(SIZE, 2)
-    depth, pixels = caches[1].depth, pixel_centers(*SIZE, jnp.float32).reshape(-1, 2)
-    rays = view_rays(cameras[1], target, pixels, shape=SIZE, near=jnp.min(depth) / 2)
-    walk = jax.jit(search, static_argnums=(3, 4))
-    data = -1 / depth, rays.origin, rays.direction, "pyramid", most
-    run = lambda: jax.block_until_ready(walk(*data))
-    found = benchmark.pedantic(run, rounds=7, warmup_rounds=1)
-    taken, cut = int(found.steps.max()), float(jnp.mean(found.exhausted))
-    benchmark.extra_info |= {"most steps taken": taken, "share of rays cut short": cut}
-    print(f"at most {most}: {taken} steps, {cut:.1%} of the rays cut short")
-    assert (cut > 0) == (most is not None)
+    full, plan, data, _ = case("sources")
+    planned = plan.recipe
+    recipe = planned if which == "planned" else dataclasses.replace(planned, max_steps=None)
+    if which == "nor by length":
+        recipe = dataclasses.replace(recipe, parts=tuple(map(in_rows, recipe.parts)))
+    run = lambda: jax.block_until_ready(recipe(*data))
+    picture, _ = benchmark.pedantic(run, rounds=15, warmup_rounds=1)
+    assert recipe.max_steps == (planned.max_steps if which == "planned" else None)
+    assert np.sqrt(np.mean((picture - full(*data)[0]) ** 2)) <= ERROR

@@ -1,5 +1,6 @@
 """What every plan promises, tried on two hundred random scenes of each effect."""
 
+import itertools
 import statistics
 
 import numpy as np
@@ -34,6 +35,14 @@ class Promises(list):
 def of_pictures(result):
     """The picture, without a coverage."""
     return result[0] if isinstance(result, tuple) else result
+
+
+@pytest.fixture
+def later_is_quicker(monkeypatch):
+    """Each way is said to be quicker than those before: the last within the error is taken."""
+    turns = itertools.count(1)
+    timed = lambda call, data: (of_pictures(call(*data)), 1 / next(turns))
+    monkeypatch.setattr(_plan, "timed", timed)
 
 
 @pytest.fixture(scope="session")

@@ -11,20 +11,23 @@ from jaxfx import PinholeCamera, budget, reproject
 SIZE = (10, 12)
 
 
+def along(x):
+    """A camera of the scene, moved by so much to the right."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    height, width = SIZE
+    return PinholeCamera.from_fov(1.0, height=height, width=width, world_from_camera=pose)
+
+
 def scene(rng):
-    """A smooth wall, seen by two cameras that paint it nearly the same."""
+    """A wall, flat or rough, seen by two cameras that paint it nearly the same."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] / 10
-    cameras, images, step = [], [], rng.uniform(0.01, 0.6)
-    for place in (0.0, step):
-        pose = np.eye(4)
-        pose[0, 3] = place
-        height, width = SIZE
-        cameras.append(
-            PinholeCamera.from_fov(1.0, height=height, width=width, world_from_camera=pose)
-        )
+    cameras, images = [along(0.0), along(rng.uniform(0.01, 0.6))], []
+    for _ in cameras:
         noise = 10 ** rng.uniform(-4, -1) * rng.normal(size=(*SIZE, 1))
         images.append(np.stack([0.5 + 0.3 * np.sin(2 * x + y)], axis=-1) + noise)
-    return images, [np.full(SIZE, 4.0)] * 2, cameras, cameras[0]
+    rough = rng.choice([0, 0.5]) * rng.normal(size=SIZE)
+    return images, [4 + rough] * 2, cameras, cameras[0]
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +47,43 @@ def test_some_plans_leave_a_source_out_and_some_a_few_tiles_of_it(plans):
     texts = [str(plan) for plan, _, _ in plans]
     assert any("all of sources 1, where others show next to the same" in text for text in texts)
     assert any("% of the rays, where" in text for text in texts)
+    assert any("steps of a ray after" in text for text in texts)
 
 
-def test_a_plan_knows_what_the_effect_knows(plans):
+def test_a_plan_knows_what_the_effect_knows(later_is_quicker):
     """A source that alone sees some pixels is drawn there, however much error is allowed."""
-    rng = np.random.default_rng(0)
-    images, depths, cameras, _ = scene(rng)
-    between = np.eye(4)
-    between[0, 3] = 2.0
-    height, width = SIZE
-    target = PinholeCamera.from_fov(1.0, height=height, width=width, world_from_camera=between)
-    data = (images, depths, cameras, target)
+    images, depths, cameras, _ = scene(np.random.default_rng(0))
+    data = (images, depths, cameras, along(2.0))
     known = reproject.blend(*data)[1]
     assert 0 < known.mean() < 1
-    np.testing.assert_array_equal(budget.reproject(*data, max_error=10.0)(*data)[1], known)
+    plan = budget.reproject(*data, max_error=10.0)
+    assert "% of the rays" in str(plan)
+    np.testing.assert_array_equal(plan(*data)[1], known)
+
+
+def test_rays_that_show_nothing_are_cut_short(later_is_quicker):
+    """Between posts they go on, out of the picture; and nobody misses what they would show."""
+    posts = np.where(np.arange(SIZE[1]) % 6 < 1, 2.0, 6.0) * np.ones(SIZE)
+    data = [np.ones((*SIZE, 1))], [posts], [along(0.0)], along(2.0)
+    plan = budget.reproject(*data, max_error=0.0)
+    assert "steps of a ray after" in str(plan)
+    for own, exact in zip(plan(*data), reproject.blend(*data), strict=True):
+        np.testing.assert_array_equal(own, exact)
+
+
+def test_steps_that_show_something_are_taken(later_is_quicker):
+    """Though the error allowed is more than they make: without them pixels would be lost."""
+    ((image, _), (depth, _), (camera, _), _) = scene(np.random.default_rng(2))
+    data = [image], [depth], [camera], along(1.0)
+    plan = budget.reproject(*data, max_error=0.2)
+    np.testing.assert_array_equal(plan(*data)[1], reproject.blend(*data)[1])
+
+
+def test_where_nothing_is_seen_the_plan_sees_nothing(later_is_quicker):
+    images, depths, cameras, _ = scene(np.random.default_rng(0))
+    data = images, depths, cameras, along(100.0)
+    plan = budget.reproject(*data, max_error=0.1)
+    assert np.asarray(plan(*data)[1]).sum() == 0
 
 
 def test_a_negative_error_is_refused():
