@@ -76,9 +76,13 @@ def _transposed(
     """The transpose of `separable`: itself, but what leaves the frame returns to its border."""
     half = weights[0].size // 2
     wide = jnp.pad(bar, ((half, half), (half, half), (0, 0)))
-    wide = separable("discrete", wide, *weights)
+    return folded(separable("discrete", wide, *weights), half)
+
+
+def folded(wide: Float[Array, "H W c"], margin: int) -> Float[Array, "h w c"]:
+    """The transpose of a margin that repeats the border: the sum of what is beyond it."""
     for axis in (0, 1):
-        first, inside, last = jnp.split(wide, (half + 1, wide.shape[axis] - half - 1), axis)
+        first, inside, last = jnp.split(wide, (margin + 1, wide.shape[axis] - margin - 1), axis)
         ends = (jnp.sum(end, axis, keepdims=True) for end in (first, last))
         wide = jnp.concatenate([next(ends), inside, next(ends)], axis)
     return wide

@@ -160,7 +160,7 @@ def _needed(
     tile_of_ray = np.append(tile, 0)[seen.pixel]
     own = place[tile_of_ray, source]
     squares = _squares(seen, own, np.arange(count, -1, -1), size)
-    numbers = squares.shape[1] * images[0].shape[2]
+    numbers = squares.shape[1] * seen.color.shape[1]
     kept = count - spend(sums(squares, tile), max_error, numbers)
     uses, steps = (place < kept[:, None])[tile].T, steps[:, :-1]
 

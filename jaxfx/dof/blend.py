@@ -9,6 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfx._filter import folded
+from jaxfx._linear import linear
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._discs import vogel
 from jaxfx.dof._inputs import check_arguments, defocused
@@ -86,14 +88,33 @@ def _filter(
     image: Float[Array, "height width channel"], kernel: Float[np.ndarray, "side side"]
 ) -> Float[Array, "height width channel"]:
     """`image` under a small sparse kernel, the frame's own pixels repeated beyond it."""
-    height, width, channels = image.shape
     reach = len(kernel) // 2
-    padded = jnp.pad(image, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
+
+    def push(image: Array) -> Array:
+        return _sums(jnp.pad(image, _margin(reach), mode="edge"), kernel)
+
+    def pull(bar: Array) -> Array:
+        wide = jnp.pad(bar, _margin(2 * reach))
+        return folded(_sums(wide, kernel[::-1, ::-1]), reach)
+
+    return push(image) if 1 in image.shape[:2] else linear(push, pull, push, image)
+
+
+def _margin(pixels: int) -> tuple[tuple[int, int], ...]:
+    return (pixels, pixels), (pixels, pixels), (0, 0)
+
+
+def _sums(
+    wide: Float[Array, "H W channel"], kernel: Float[np.ndarray, "side side"]
+) -> Float[Array, "height width channel"]:
+    """The sums under the kernel wherever it fits in."""
+    height, width = (size - len(kernel) + 1 for size in wide.shape[:2])
+    channels = wide.shape[2]
     # Rows of pixels and channels are one long axis; and no tap computes the padding anew.
-    rows = jax.lax.optimization_barrier(padded.reshape(height + 2 * reach, -1))
-    total = jnp.zeros((height, width * channels), image.dtype)
+    rows = jax.lax.optimization_barrier(wide.reshape(len(wide), -1))
+    total = jnp.zeros((height, width * channels), wide.dtype)
     for row, column in np.argwhere(kernel):
         start = column * channels
         part = rows[row : row + height, start : start + width * channels]
-        total = total + jnp.asarray(kernel[row, column], image.dtype) * part
-    return total.reshape(image.shape)
+        total = total + jnp.asarray(kernel[row, column], wide.dtype) * part
+    return total.reshape(height, width, channels)

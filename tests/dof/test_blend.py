@@ -58,3 +58,16 @@ def test_a_bad_pixel_spoils_what_its_taps_reach():
     assert not spoiled[:, 25:].any()
     depth[20, 20], image[20, 20] = np.nan, 0.5
     assert np.isnan(call(image, depth)[20, 20]).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (4, 1), (2, 3), (9, 8)])
+def test_its_transpose_is_that_of_what_it_does(shape, quick):
+    """The frame's border, which is repeated as far as taps read, gets back what they read."""
+    rng = np.random.default_rng(0)
+    image, bar = rng.random((2, *shape, 1))
+    depth = rng.uniform(1, 9, shape)
+    call = lambda image: dof.blend(image, depth, ThinLens(0.3, 3.0, 60.0), max_coc=5.0)
+    columns = jax.vmap(call)(np.eye(image.size).reshape(-1, *image.shape))
+    expected = np.tensordot(columns, bar, 3).reshape(image.shape)
+    (pulled,) = jax.vjp(call, image)[1](bar)
+    np.testing.assert_allclose(pulled, expected, atol=1e-14)
