@@ -133,7 +133,7 @@ def find_places(
 def lit(
     texel: Float[Array, "*place"],
     threshold: Float[Array, "*place"],
-    softness: Float[Array, ""] | None,
+    softness: Float[Array, "..."] | None,
 ) -> Float[Array, "*place"]:
     """1 where the texel does not shadow, 0 where it does; between the two within `softness`."""
     if softness is None:
@@ -143,7 +143,14 @@ def lit(
     return along * along * (3 - 2 * along)
 
 
-def half_width(softness: Float[Array, ""], dtype: Any) -> Float[Array, ""]:
+def everywhere(
+    softness: Float[Array, ""] | None, places: Places
+) -> Float[Array, "*place"] | None:
+    """One a place: its derivative is summed over all places once, and not by each tap."""
+    return None if softness is None else jnp.broadcast_to(softness, places.threshold.shape)
+
+
+def half_width(softness: Float[Array, "..."], dtype: Any) -> Float[Array, "..."]:
     """Half of the depths that are neither lit nor shadowed; never 0, so that it may divide."""
     return jnp.maximum(softness.astype(dtype) / 2, jnp.finfo(dtype).tiny * 1e4)
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxfx.shadow import _taps
 from jaxfx.shadow._taps import Kernel, Places
@@ -160,6 +160,7 @@ def average(
     """The mean comparison of the taps about each place."""
     if kernel == "box" and softness is None and size >= _LEAST_WINDOW:
         return _share(texels, places, size)
+    softness = _taps.everywhere(softness, places)
 
     def compared(dx, dy):
         return _taps.lit(read(texels, places, dx, dy), places.threshold, softness)
@@ -182,7 +183,7 @@ def average(
 
     total, down = _taps.sum_rows(row, size)
     share = total / (down * sum(across))
-    return jnp.where(share > 1, 1, share)  # by rounding
+    return _one_where(share > 1, share)  # by rounding
 
 
 def read(texels: Texels, places: Places, dx: int, dy: Any) -> Float[Array, "*place"]:
@@ -208,4 +209,9 @@ def _share(texels: Texels, places: Places, size: int) -> Float[Array, "*place"]:
 
 def _mean(total: Float[Array, "*place"], size: int) -> Float[Array, "*place"]:
     """The total over `size**2`; of all that can be, 1, whatever XLA makes of a division."""
-    return jnp.where(total == size**2, 1, total / size**2)
+    return _one_where(total == size**2, total / size**2)
+
+
+def _one_where(all_lit: Bool[Array, "*place"], share: Float[Array, "*place"]) -> Array:
+    """As a sum: its derivative asks nothing of the total, which each tap would add up anew."""
+    return share + jax.lax.stop_gradient(jnp.where(all_lit, 1 - share, 0))

@@ -66,6 +66,7 @@ def _pcss(shadow_map, receivers, camera, bias, slope_bias, softness, light_size,
     dtype = _taps.common_dtype(shadow_map, receivers)
     texels = _taps.pad_map(shadow_map, size, dtype)
     places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
+    softness = _taps.everywhere(softness, places)
 
     def blockers(dy: Any):
         count, total = jnp.zeros_like(places.threshold), jnp.zeros_like(places.threshold)
