@@ -3,6 +3,7 @@
 The floor under everything else: arrays only, no types of this package.
 """
 
+import functools
 import math
 from typing import Any
 
@@ -112,6 +113,14 @@ def safe_divide(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, 
     """`x / y`, with value and derivatives 0 where `y` is 0."""
     nonzero = y != 0
     return jnp.where(nonzero, x / jnp.where(nonzero, y, 1), 0)
+
+
+def sum_planes(planes: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
+    """The sum over a short axis before the last, plane by plane.
+
+    XLA's own reduction over such an axis takes ten times as long on a CPU.
+    """
+    return functools.reduce(jnp.add, jnp.moveaxis(planes, axis, 0))
 
 
 def normalize(vector: Float[Array, "... n"]) -> Float[Array, "... n"]:

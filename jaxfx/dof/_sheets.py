@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import clip01
+from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof._adjoint import with_adjoint
 from jaxfx.dof._slices import APART, SLICES, Grid, Sheets, across_of, ordered, share_of
 from jaxfx.dof._sprites import POINT_RADIUS, row_half_width
@@ -114,7 +114,7 @@ def _adjoint(
     filling = _filled(grid, sheets)
     discs = grid.discs(sheets)
     bar, late_bar = jnp.split(bar, 2)
-    along = lambda bar, light: (bar * light).sum(axis=0)
+    along = lambda bar, light: sum_planes(bar * light)
     # The slice that fills a lens gives it as much of its colour as there is room.
     arrived, part = filling.arrived, filling.part
     color = arrived / jnp.where(part > 0, arrived[-1], 1)[None]
@@ -168,7 +168,7 @@ def plain(reach: int, sheets: Sheets) -> Float[Array, "twice_value height width"
                 edge = 0.5 - column.astype(radius.dtype)
                 end, start = there(moved) + there(span), there(moved) - there(span)
                 cover = clip01(end + edge) - clip01(start + edge)
-                return sums + (cover[:, None] * there(row_light)).sum(axis=0), None
+                return sums + sum_planes(cover[:, None] * there(row_light)), None
 
             return jax.lax.scan(jax.checkpoint(add_tap), sums, jnp.arange(-across, across + 1))
 

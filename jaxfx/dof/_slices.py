@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import clip01
+from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof._paint import _add, _read
 from jaxfx.dof._spans import _too_bright
 from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
@@ -284,12 +284,12 @@ class Grid:
                     step = _read(steps, end.cell[:, None])
                     ahead, here = step[:, :v], step[:, v:]
                     arriving = -end.side * (end.whole * ahead - end.cut[:, None] * here)
-                    moving = end.side * end.facing * (value * here).sum(axis=1)
+                    moving = end.side * end.facing * sum_planes(value * here, 1)
                     return (
                         value_bar + end.facing[:, None] * arriving,
                         radius_bar + end.by_radius * moving,
                         tilt_bar[0] + end.by_tilt * moving,
-                        tilt_bar[1] + end.row * (value * arriving).sum(axis=1),
+                        tilt_bar[1] + end.row * sum_planes(value * arriving, 1),
                     )
 
                 zero = jnp.zeros_like(share)
@@ -297,7 +297,7 @@ class Grid:
                 value_bar, *rest = self._each_end(
                     disc, ids, share, column, visit, nothing, slopes=True
                 )
-                place_bar = share_slope * (value * value_bar).sum(axis=1)
+                place_bar = share_slope * sum_planes(value * value_bar, 1)
                 found = [value_bar * share[:, None]]
                 found += [x[:, None] for x in (*(x * share for x in rest), place_bar, zero)]
                 return bars.at[block, ids].add(jnp.concatenate(found, axis=1))

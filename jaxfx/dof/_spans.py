@@ -16,7 +16,7 @@ What it does not do well: below a radius of about eight, `tiles` are quicker.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import clip01
+from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof import _tiles
 from jaxfx.dof._adjoint import with_adjoint
 from jaxfx.dof._paint import paint, read_back
@@ -87,7 +87,7 @@ def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]
     direct, near, (before, behind) = _parts(planes)
     value, blurred = planes.value, clip01(planes.coc - 1)
     near_bar = _tiles.adjoint(reach, near, bar)
-    blurred_bar = (bar * paint(reach, value, behind)).sum(axis=0)
+    blurred_bar = sum_planes(bar * paint(reach, value, behind))
     bars = (
         jnp.where(direct[None], near_bar.value, 0),
         jnp.where(direct, near_bar.radius, 0),

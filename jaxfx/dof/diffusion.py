@@ -146,23 +146,27 @@ def _explicit(image, depth, lens, edge, max_coc):
     steps = math.ceil(max_coc**2 / 32 / _LARGEST_CONDUCTANCE)
     inner = math.isqrt(steps)
     outer = -(-steps // inner)
-    rows, columns = (g[None] / (outer * inner) for g in _conductances(view, edge))
+    rows, columns = (g / (outer * inner) for g in _conductances(view, edge))
 
-    def step(heat, _):
-        down = rows * jnp.diff(heat, axis=1)
-        right = columns * jnp.diff(heat, axis=2)
-        heat = heat + jnp.pad(down, ((0, 0), (0, 1), (0, 0)))
-        heat = heat - jnp.pad(down, ((0, 0), (1, 0), (0, 0)))
-        heat = heat + jnp.pad(right, ((0, 0), (0, 0), (0, 1)))
-        return heat - jnp.pad(right, ((0, 0), (0, 0), (1, 0))), None
+    def flow(heat):
+        down = rows * jnp.diff(heat, axis=0)
+        right = columns * jnp.diff(heat, axis=1)
+        heat = heat + jnp.pad(down, ((0, 1), (0, 0)))
+        heat = heat - jnp.pad(down, ((1, 0), (0, 0)))
+        heat = heat + jnp.pad(right, ((0, 0), (0, 1)))
+        return heat - jnp.pad(right, ((0, 0), (1, 0)))
+
+    def step(channels, _):
+        # Each apart: what they give to the derivative in a conductance is added as pictures.
+        return tuple(map(flow, channels)), None
 
     @jax.checkpoint
-    def steps_of_one(heat, _):
-        return jax.lax.scan(step, heat, None, inner)
+    def steps_of_one(channels, _):
+        return jax.lax.scan(step, channels, None, inner)
 
-    heat = jnp.moveaxis(view.image, -1, 0)
-    heat, _ = jax.lax.scan(steps_of_one, heat, None, outer)
-    result = jnp.moveaxis(heat, 0, -1)
+    channels = tuple(jnp.moveaxis(view.image, -1, 0))
+    channels, _ = jax.lax.scan(steps_of_one, channels, None, outer)
+    result = jnp.stack(channels, axis=-1)
     return jnp.where(view.bad[..., None], jnp.nan, result).astype(image.dtype)
 
 

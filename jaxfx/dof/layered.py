@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import check, check_depth, check_image, clip01, parameter
+from jaxfx._numerics import check, check_depth, check_image, clip01, parameter, sum_planes
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof._sheets import composited
 from jaxfx.dof._shift import shift
@@ -136,7 +136,7 @@ def _sheet(
     signed = jnp.where(defocus < 0, -2, 2) * radius
     tilt = jnp.stack([_slope(defocus, 1), _slope(defocus, 0)]) / signed[None]
     # No weight turns negative within the disc.
-    square, most = (tilt * tilt).sum(axis=0), 1 / (radius + POINT_RADIUS)
+    square, most = sum_planes(tilt * tilt), 1 / (radius + POINT_RADIUS)
     steep = square > most * most
     tilt = tilt * jnp.where(steep, most / jnp.sqrt(jnp.where(steep, square, 1)), 1)[None]
     value = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)

@@ -42,7 +42,7 @@ class Model(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, lights: Sequence[Light]) -> Float[Array, "height width 3"]:
-        return jnp.sum(jnp.stack(self.terms(lights)), axis=0)
+        return sum(self.terms(lights))
 
     def terms(self, lights: Sequence[Light]) -> list[Float[Array, "height width 3"]]:
         """What each light adds to the picture."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import safe_divide
+from jaxfx._numerics import safe_divide, sum_planes
 
 
 class Patch(NamedTuple):
@@ -26,7 +26,7 @@ class Patch(NamedTuple):
         for row, column, share in zip(self.rows, self.columns, self.shares, strict=True):
             texel = values.at[row, column].get(mode="promise_in_bounds")
             total = total + share * _unless_unseen(texel, share)
-        return safe_divide(total, jnp.sum(self.shares, axis=0))
+        return safe_divide(total, sum_planes(self.shares))
 
     def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
         """The same of every channel, ray channel.
@@ -43,7 +43,7 @@ class Patch(NamedTuple):
         shares = self.shares.astype(image.dtype)
         total = jnp.zeros((shares.shape[1], image.shape[2]), image.dtype)
         total, _ = jax.lax.scan(add, total, (self.rows, self.columns, shares))
-        whole = jnp.broadcast_to(jnp.sum(shares, axis=0)[:, None], total.shape)
+        whole = jnp.broadcast_to(sum_planes(shares)[:, None], total.shape)
         return safe_divide(total, whole)
 
 

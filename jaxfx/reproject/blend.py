@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import check_image, normalize, safe_divide, working_dtype
+from jaxfx._numerics import check_image, normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.reproject._rays import Camera
@@ -92,8 +92,8 @@ def _blended(
     front = masks & (z <= (1 + hole_threshold) * nearest[None])
     weight = jax.lax.stop_gradient(jnp.where(front, along**8, 0))[..., None]
     weight = weight.astype(pictures.dtype)
-    total = jnp.sum(jnp.where(weight > 0, pictures, 0) * weight, axis=0)
-    weights = jnp.broadcast_to(jnp.sum(weight, axis=0), total.shape)
+    total = sum_planes(jnp.where(weight > 0, pictures, 0) * weight)
+    weights = jnp.broadcast_to(sum_planes(weight), total.shape)
     alpha = (weights[:, 0] > 0).astype(total.dtype)
     return safe_divide(total, weights).reshape(*size, -1), alpha.reshape(size)
 

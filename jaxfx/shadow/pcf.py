@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfx._filter import apart
 from jaxfx.shadow import _taps
 from jaxfx.shadow._taps import Kernel, Places
 from jaxfx.shadow.receivers import Receivers
@@ -147,7 +148,9 @@ def filtered(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
     dtype = _taps.common_dtype(shadow_map, receivers)
     texels = _taps.pad_map(shadow_map, size, dtype)
     places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
-    return average(texels, places, softness, size, kernel).astype(receivers.z.dtype)
+    result = average(texels, places, softness, size, kernel).astype(receivers.z.dtype)
+    # In memory, so that no tap's derivative adds up anew what a loss asks of the result.
+    return apart(result, lambda: result)
 
 
 def average(
