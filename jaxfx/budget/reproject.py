@@ -164,12 +164,12 @@ def _needed(
     kept = count - spend(sums(squares, tile), max_error, numbers)
     uses, steps = (place < kept[:, None])[tile].T, steps[:, :-1]
 
-    most = np.max(steps, where=uses, initial=0)
-    bounds = np.unique(np.arange(1, _BOUNDS) * most // _BOUNDS)
-    needed = np.where(own < kept[tile_of_ray], seen.steps, np.iinfo(np.int32).max)
-    squares = _squares(seen, needed, bounds + 1, size)
+    longest = int(np.max(steps, where=uses, initial=0))
+    bounds = np.unique(np.arange(1, _BOUNDS) * longest // _BOUNDS)
+    taken = np.where(own < kept[tile_of_ray], seen.steps, np.iinfo(np.int32).max)
+    squares = _squares(seen, taken, bounds + 1, size)
     enough = bounds[(bounds > 0) & (squares.sum(axis=1) <= allowed(max_error, numbers))]
-    return uses, steps, enough.min().item() if enough.size else None
+    return uses, steps, int(enough[0]) if enough.size else None
 
 
 @eqx.filter_jit
@@ -219,8 +219,8 @@ def _squares(
     seen: Seen, place: np.ndarray, kept: np.ndarray, size: tuple[int, int]
 ) -> Float[np.ndarray, "level pixel"]:
     """For every number of places that is kept, the squared error that each pixel makes."""
-    place, kept = jnp.asarray(place, jnp.int32), jnp.asarray(kept, jnp.int32)
-    return np.asarray(_errors(seen, place, kept, size[0] * size[1]), np.float64)
+    places, levels = jnp.asarray(place, jnp.int32), jnp.asarray(kept, jnp.int32)
+    return np.asarray(_errors(seen, places, levels, size[0] * size[1]), np.float64)
 
 
 @eqx.filter_jit

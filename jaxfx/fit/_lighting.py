@@ -42,7 +42,7 @@ class Model(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, lights: Sequence[Light]) -> Float[Array, "height width 3"]:
-        return sum(self.terms(lights))
+        return functools.reduce(jnp.add, self.terms(lights))
 
     def terms(self, lights: Sequence[Light]) -> list[Float[Array, "height width 3"]]:
         """What each light adds to the picture."""
