@@ -31,7 +31,7 @@ def shadowed():
     rng = np.random.default_rng(0)
     fields = [jnp.asarray(rng.uniform(1, SIDE, (SIDE, SIDE))) for _ in range(4)]
     shadow_map = jnp.asarray(rng.uniform(1, 9, (SIDE, SIDE)))
-    pcf = lambda *data: shadow.pcf(data[0], data[1], size=7, softness=data[2])
+    pcf = lambda *data: shadow.pcf(data[0], data[1], size=5, softness=data[2])
     return pcf, (shadow_map, shadow.Receivers(*fields), jnp.asarray(0.1))
 
 

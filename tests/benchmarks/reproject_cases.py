@@ -12,6 +12,15 @@ from jaxfx.reproject import intersect
 # Fields of depth, and rays that slant over them, `slope` texels to each tenth of depth.
 
 
+def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
+    """A camera somewhere, turned about the vertical by so many radians."""
+    pose = np.eye(4)
+    c, s = np.cos(turn), np.sin(turn)
+    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    pose[:3, 3] = at
+    return PinholeCamera.from_fov(0.9, height=height, width=width, world_from_camera=pose)
+
+
 def smooth(size):
     y, x = np.mgrid[:size, :size] / size
     return 0.6 + 0.1 * np.sin(9 * x) * np.cos(7 * y)

@@ -9,7 +9,7 @@ import numpy as np
 import reproject_cases as scenes
 from failures import Found, case, not_measured
 
-from jaxfx import PinholeCamera, scene
+from jaxfx import scene
 from jaxfx.reproject import warp
 
 
@@ -166,14 +166,6 @@ def posts_and_gaps(method):
     return Found(figures, picture)
 
 
-def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
-    pose = np.eye(4)
-    c, s = np.cos(turn), np.sin(turn)
-    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    pose[:3, 3] = at
-    return PinholeCamera.from_fov(0.9, height=height, width=width, world_from_camera=pose)
-
-
 WARPS = {
     "pyramid": ("pyramid", np.float64),
     "pyramid, float32": ("pyramid", np.float32),
@@ -190,7 +182,7 @@ def same_camera(method):
     image = rng.random((24, 32, 3)).astype(dtype)
     depth = rng.uniform(1, 9, (24, 32)).astype(dtype)
     depth[rng.random((24, 32)) < 0.2] = np.inf
-    eye = camera(at=(3.1, -2.2, 0.7), turn=0.3)
+    eye = scenes.camera(at=(3.1, -2.2, 0.7), turn=0.3)
     drawn, alpha = map(np.asarray, warp(image, depth, eye, eye, method=search))
     figures = {"image": float(np.abs(drawn - image).max()), "alpha": float((1 - alpha).max())}
     return Found(figures, drawn)
@@ -286,7 +278,7 @@ def _no_hits(method: str) -> Found:
 def _holed_plane() -> Found:
     y, x = np.mgrid[:24, :32] / 24
     image = np.stack([np.sin(7 * x + y), np.cos(5 * y - x), x * y], axis=-1) / 2 + 0.5
-    depth, eyes = np.full((24, 32), 2.0), (camera(), camera(at=(0.1, 0, 0)))
+    depth, eyes = np.full((24, 32), 2.0), (scenes.camera(), scenes.camera(at=(0.1, 0, 0)))
     draw = lambda image, depth: map(np.asarray, warp(image, depth, *eyes))
     (whole, _), picture, wrong, change = draw(image, depth), None, 0, 0.0
     far = np.ones((24, 32), bool)

@@ -7,40 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from failures import Found, case
-from shadow_scenes import Still, acne_and_leaks, plate, two_discs
+from shadow_scenes import Still, acne_and_leaks, noise, plate, steps, two_discs
 
 from jaxfx import OrthographicCamera, shadow
 
 
 HARD = "zero: the comparison is a step"
-
-
-def steps(seed: int, dtype: Any = np.float32) -> tuple[np.ndarray, shadow.Receivers]:
-    """A map of a few flat depths with single texels among them: windows that agree exist."""
-    rng = np.random.default_rng(seed)
-    shadow_map = np.repeat(np.repeat(rng.choice([1.0, 2.0, np.inf], (4, 5)), 16, 0), 16, 1)
-    shadow_map[rng.integers(0, 64, 5), rng.integers(0, 80, 5)] = rng.uniform(0.5, 3, 5)
-    u, v = (rng.uniform(-6, count + 6, (40, 50)) for count in (80, 64))
-    z = rng.choice([-1.0, 1.0, 1.5, 2.0, 2.5, np.nan, np.inf], (40, 50))
-    fields = (u, v, z, rng.uniform(0, 0.2, (40, 50)))
-    return shadow_map.astype(dtype), shadow.Receivers(*(jnp.asarray(f, dtype) for f in fields))
-
-
-def noise(
-    seed: int = 0,
-    map_shape: tuple[int, int] = (14, 17),
-    shape: tuple[int, int] = (9, 11),
-    dtype: Any = np.float64,
-) -> tuple[np.ndarray, shadow.Receivers]:
-    """A map with holes, and receivers in it, about it, and behind the light."""
-    rng = np.random.default_rng(seed)
-    shadow_map = rng.uniform(1, 3, map_shape)
-    shadow_map[rng.uniform(size=map_shape) < 0.1] = np.inf
-    u, v = (rng.uniform(-4, count + 4, shape) for count in map_shape[::-1])
-    z = rng.uniform(1, 3, shape)
-    z[rng.uniform(size=shape) < 0.1] = -1
-    fields = (u, v, z, rng.uniform(0, 0.2, shape))
-    return shadow_map.astype(dtype), shadow.Receivers(*(f.astype(dtype) for f in fields))
 
 
 SIZES = {f"{size} texels": (size, np.float32) for size in (1, 3, 7, 15, 31)}

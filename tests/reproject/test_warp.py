@@ -9,20 +9,13 @@ import numpy as np
 import pytest
 import reproject_cases as cases
 from quick import quick_jit
+from reproject_cases import camera
 
 from jaxfx import OrthographicCamera, PinholeCamera, scene
 from jaxfx.reproject import warp
 
 
 pytestmark = pytest.mark.usefixtures("quick")
-
-
-def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
-    pose = np.eye(4)
-    c, s = np.cos(turn), np.sin(turn)
-    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    pose[:3, 3] = at
-    return PinholeCamera.from_fov(0.9, height=height, width=width, world_from_camera=pose)
 
 
 def picture(height=24, width=32):

@@ -1,9 +1,8 @@
-"""A naive percentage-closer filter, and random maps and receivers to try it on."""
+"""A naive percentage-closer filter, and a random map with receivers to try it on."""
 
 import numpy as np
 import pytest
-
-from jaxfx import shadow
+from shadow_scenes import noise
 
 
 def naive_pcf(shadow_map, receivers, size, bias=0.0, slope_bias=0.0):
@@ -22,18 +21,6 @@ def naive_pcf(shadow_map, receivers, size, bias=0.0, slope_bias=0.0):
     return visible / size**2
 
 
-def random_case(seed=0, map_shape=(14, 17), shape=(9, 11), dtype=np.float64):
-    """A map with holes, and receivers in it, about it, and behind the light."""
-    rng = np.random.default_rng(seed)
-    shadow_map = rng.uniform(1, 3, map_shape)
-    shadow_map[rng.uniform(size=map_shape) < 0.1] = np.inf
-    u, v = (rng.uniform(-4, count + 4, shape) for count in map_shape[::-1])
-    z = rng.uniform(1, 3, shape)
-    z[rng.uniform(size=shape) < 0.1] = -1
-    fields = (u, v, z, rng.uniform(0, 0.2, shape))
-    return shadow_map.astype(dtype), shadow.Receivers(*(f.astype(dtype) for f in fields))
-
-
 @pytest.fixture
 def case():
-    return random_case()
+    return noise()

@@ -11,35 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from quick import quick_jit
-from shadow_scenes import plate
+from shadow_scenes import noise, plate, steps
 
 from jaxfx import shadow
 from jaxfx.shadow import _compact
 from jaxfx.shadow._windows import extremes, unions
 from jaxfx.shadow.edge import usual_dilation
 
-from .conftest import naive_pcf, random_case
+from .conftest import naive_pcf
 
 
 pytestmark = pytest.mark.usefixtures("quick")
-
-
-def steps_case(seed, dtype=np.float32):
-    """A map of a few flat depths with single texels among them: windows that agree exist."""
-    rng = np.random.default_rng(seed)
-    shadow_map = np.repeat(np.repeat(rng.choice([1.0, 2.0, np.inf], (4, 5)), 16, 0), 16, 1)
-    shadow_map[rng.integers(0, 64, 5), rng.integers(0, 80, 5)] = rng.uniform(0.5, 3, 5)
-    u, v = (rng.uniform(-6, count + 6, (40, 50)) for count in (80, 64))
-    z = rng.choice([-1.0, 1.0, 1.5, 2.0, 2.5, np.nan, np.inf], (40, 50))
-    fields = (u, v, z, rng.uniform(0, 0.2, (40, 50)))
-    return shadow_map.astype(dtype), shadow.Receivers(*(jnp.asarray(f, dtype) for f in fields))
 
 
 @pytest.mark.parametrize(
     ("kernel", "softness"), [("box", 0.2), ("tent", None), ("gaussian", 0.2)]
 )
 def test_depth_mask_is_pcf_in_every_form(kernel, softness):
-    case = steps_case(3)
+    case = steps(3)
     options = {"size": 5, "kernel": kernel, "softness": softness, "bias": 0.02}
     visible = shadow.edge_pcf(*case, mask="depth", **options)
     np.testing.assert_allclose(visible, shadow.pcf(*case, **options), atol=1e-6)
@@ -47,7 +36,7 @@ def test_depth_mask_is_pcf_in_every_form(kernel, softness):
 
 @pytest.mark.parametrize("size", [3, 9])
 def test_depth_mask_is_where_the_comparisons_differ(size):
-    case = steps_case(4, np.float64)
+    case = steps(4, np.float64)
     found = shadow.candidates(*case, size=size, mask="depth")
     share = naive_pcf(
         case[0], case[1]._replace(z=np.where(np.isfinite(case[1].z), case[1].z, -1)), size
@@ -81,12 +70,12 @@ def test_chunks_run_as_many_as_there_are_candidates():
         return total + jnp.sum(pixels < size)
 
     size = 3 * _compact._CHUNK
-    for count_set, steps in ((0, 0), (1, 1), (_compact._CHUNK, 1), (_compact._CHUNK + 1, 2)):
+    for count_set, rounds in ((0, 0), (1, 1), (_compact._CHUNK, 1), (_compact._CHUNK + 1, 2)):
         calls.clear()
         where = jnp.arange(size) < count_set
         assert _compact.fold(where, 0, lambda pixels: pixels, count) == count_set
         jax.effects_barrier()
-        assert len(calls) == steps
+        assert len(calls) == rounds
 
 
 @pytest.mark.parametrize(
@@ -165,7 +154,7 @@ def test_nothing_to_filter_is_nothing_done(case):
 
 
 def test_derivatives_are_pcfs():
-    shadow_map, receivers = random_case()
+    shadow_map, receivers = noise()
     options = {"size": 3, "kernel": "tent"}
 
     def loss(function, shadow_map, z, bias, softness):

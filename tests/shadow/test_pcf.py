@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from quick import quick_jit
+from shadow_scenes import noise
 
 from jaxfx import shadow
 
-from .conftest import naive_pcf, random_case
+from .conftest import naive_pcf
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -44,7 +45,7 @@ def test_the_example_of_the_source():
 
 
 def test_prefiltered_is_the_mean_compared_once():
-    shadow_map, receivers = random_case(map_shape=(20, 20))
+    shadow_map, receivers = noise(map_shape=(20, 20))
     shadow_map = np.where(np.isinf(shadow_map), 2.0, shadow_map)
     visible = np.asarray(shadow.prefiltered(shadow_map, receivers, size=5))
     padded = np.pad(shadow_map, 10, constant_values=np.inf)
@@ -98,7 +99,7 @@ def test_a_bad_texel_or_receiver_spoils_only_its_own(case, kernel):
 
 @pytest.mark.parametrize("map_shape", [(1, 1), (1, 9), (3, 2)])
 def test_a_map_smaller_than_the_filter(map_shape):
-    case = random_case(map_shape=map_shape)
+    case = noise(map_shape=map_shape)
     np.testing.assert_allclose(shadow.pcf(*case, size=7), naive_pcf(*case, 7), atol=1e-15)
 
 
@@ -143,7 +144,7 @@ def test_softness_tends_to_the_hard_picture(case, kernel):
 @pytest.mark.parametrize("kernel", ["tent", "gaussian"])
 def test_weights_that_follow_the_receiver_are_continuous(kernel):
     """Across a texel's border the box jumps, the others do not."""
-    shadow_map = random_case(seed=2)[0]
+    shadow_map = noise(seed=2)[0]
 
     def at(u, kernel):
         return float(shadow.pcf(shadow_map, one(u, 7.3, 2.0), size=5, kernel=kernel)[0, 0])
