@@ -1,12 +1,12 @@
 """Bilinear reads inside one surface: a texel that lies elsewhere in depth has no share."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import safe_divide, sum_planes
+from jaxfx._numerics import safe_divide
 
 
 class Patch(NamedTuple):
@@ -26,7 +26,7 @@ class Patch(NamedTuple):
         for row, column, share in zip(self.rows, self.columns, self.shares, strict=True):
             texel = values.at[row, column].get(mode="promise_in_bounds")
             total = total + share * _unless_unseen(texel, share)
-        return safe_divide(total, sum_planes(self.shares))
+        return safe_divide(total, jnp.sum(self.shares, axis=0))
 
     def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
         """The same of every channel, ray channel.
@@ -34,17 +34,17 @@ class Patch(NamedTuple):
         The loop keeps the patch in memory: fused, each channel would look for the hit anew.
         """
 
-        def add(total: Array, texel: tuple[Array, Array, Array]) -> tuple[Array, None]:
-            row, column, share = texel
+        def add(sums: tuple[Array, Array], texel: tuple[Array, Array, Array]) -> Any:
+            (total, whole), (row, column, share) = sums, texel
             color = image.at[row, column].get(mode="promise_in_bounds")
-            share = jnp.broadcast_to(share[:, None], color.shape)
-            return total + share * _unless_unseen(color, share), None
+            whole, share = whole + share, jnp.broadcast_to(share[:, None], color.shape)
+            return (total + share * _unless_unseen(color, share), whole), None
 
         shares = self.shares.astype(image.dtype)
         total = jnp.zeros((shares.shape[1], image.shape[2]), image.dtype)
-        total, _ = jax.lax.scan(add, total, (self.rows, self.columns, shares))
-        whole = jnp.broadcast_to(sum_planes(shares)[:, None], total.shape)
-        return safe_divide(total, whole)
+        sums = total, jnp.zeros_like(shares[0])
+        (total, whole), _ = jax.lax.scan(add, sums, (self.rows, self.columns, shares))
+        return safe_divide(total, jnp.broadcast_to(whole[:, None], total.shape))
 
 
 def _unless_unseen(texel: Float[Array, "*shape"], share: Float[Array, "*shape"]) -> Array:
