@@ -21,15 +21,12 @@ from jaxfx.reproject.blend import Sight, blend
 _OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
 # What a pixel that nobody shows any more adds to the squared error: coverage is kept.
 _LOST = 1e30
-# The bounds on a ray's steps that are weighed: so many equal parts of the most that one takes.
+# The bounds on a ray's steps that are weighed: whole parts, in so many, of the most it takes.
 _BOUNDS = 8
 
 
 class Seen(NamedTuple):
-    """What rays show: for which pixel each is, its colour, whether, how straight, how far.
-
-    And after how many steps.
-    """
+    """What rays show: for which pixel, its colour, whether, how straight, how far, how late."""
 
     pixel: Int[Array, " ray"]
     color: Float[Array, "ray channel"]
@@ -82,12 +79,12 @@ def reproject(
     left out one after another, from the one that has the least share on, for as long as every
     pixel that was known is known; over the whole picture those first that cost the least error.
     Rays of like length are traversed together, as a block takes the steps of its longest; and
-    what error is left goes to the least bound on steps, of eight, by which every pixel is still
+    what error is left goes to the least bound on steps, of seven, by which every pixel is still
     known: a ray that needs more shows nothing. What is left is drawn and measured against the
     effect.
 
-    It costs two renderings of all sources, one for the proof and one apart, and one by the
-    plan.
+    It costs two renderings of all sources, one for the proof and one apart, one by the plan,
+    and about one more to weigh what is left out.
 
     **Arguments:**
 
@@ -142,7 +139,7 @@ def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> 
 def _needed(
     images: Any, depths: Any, sources: Any, target: Any, size: tuple[int, int], max_error: float
 ) -> tuple[Bool[np.ndarray, "source pixel"], Int[np.ndarray, "source pixel"], int | None]:
-    """Which sources to look at for each pixel, the steps of that, and the most to be taken."""
+    """Which sources to look at for each pixel, in how many steps, and a bound on the steps."""
     tile, count = tile_of(size), len(sources)
     everything = np.ones((count, size[0] * size[1]), bool)
     parts = blocks(everything, list(zip(images, depths, sources, strict=True)))
