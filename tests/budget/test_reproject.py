@@ -2,6 +2,9 @@
 
 import inspect
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -64,11 +67,25 @@ def test_a_plan_knows_what_the_effect_knows(later_is_quicker):
 def test_rays_that_show_nothing_are_cut_short(later_is_quicker):
     """Between posts they go on, out of the picture; and nobody misses what they would show."""
     posts = np.where(np.arange(SIZE[1]) % 6 < 1, 2.0, 6.0) * np.ones(SIZE)
-    data = [np.ones((*SIZE, 1))], [posts], [along(0.0)], along(2.0)
+    image = np.random.default_rng(1).random((*SIZE, 1))
+    data = [image], [posts], [along(0.0)], along(2.0)
     plan = budget.reproject(*data, max_error=0.0)
     assert "steps of a ray after" in str(plan)
     for own, exact in zip(plan(*data), reproject.blend(*data), strict=True):
         np.testing.assert_array_equal(own, exact)
+
+    @eqx.filter_jit
+    def slopes(way, depth, tangent):
+        picture = lambda depth: way(data[0], [depth], *data[2:])[0]
+        pulled = jax.vjp(picture, depth)[1](jnp.ones((*SIZE, 1)))[0]
+        return pulled, jnp.sum(jax.jvp(picture, (depth,), (tangent,))[1])
+
+    tangent = np.random.default_rng(0).normal(size=SIZE)
+    pulled, pushed = slopes(plan, posts, tangent)
+    np.testing.assert_allclose(jnp.sum(pulled * tangent), pushed, atol=1e-12)
+    exact = slopes(reproject.blend, posts, tangent)[0]
+    assert np.abs(exact).max() > 0.01
+    np.testing.assert_allclose(pulled, exact, atol=1e-12)
 
 
 def test_steps_that_show_something_are_taken(later_is_quicker):

@@ -100,19 +100,6 @@ def test_the_low_resolution_picture_of_a_frame_of_whole_blocks_is_the_mean_of_ea
     np.testing.assert_allclose(low_resolution(jnp.asarray(image)), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("count", [1, 2, 8, 64])
-def test_vogel_points_are_spread_over_the_disc(count):
-    points = vogel(count)
-    assert points.shape == (count, 2)
-    assert (points[0] == 0).all()
-    radius = np.hypot(*points.T)
-    assert radius.max() < 1
-    # A disc's mean square radius is 1/2; that of n points on equal rings is (n - 1) / (2n - 1).
-    np.testing.assert_allclose(np.mean(radius**2), (count - 1) / (2 * count - 1))
-    if count == 64:
-        assert np.abs(points.mean(axis=0)).max() < 0.02
-
-
 def test_a_sharp_foreground_does_not_leak_and_a_blurred_one_has_a_hard_rim():
     image = np.where(np.arange(40) < 20, 1.0, 0.0)[None, :, None] * np.ones((40, 40, 1))
     depth = np.where(np.arange(40) < 20, 1.0, 2.0)[None, :] * np.ones((40, 40))

@@ -14,8 +14,6 @@ from quick import quick_jit
 from shadow_scenes import noise, plate, steps
 
 from jaxfx import shadow
-from jaxfx.shadow import _compact
-from jaxfx.shadow._windows import extremes, unions
 from jaxfx.shadow.edge import usual_dilation
 
 from .conftest import naive_pcf
@@ -43,54 +41,6 @@ def test_depth_mask_is_where_the_comparisons_differ(size):
     )
     np.testing.assert_array_equal(found.where, (share > 0) & (share < 1))
     assert int(found.comparisons) == 2 * share.size + int(found.where.sum()) * size**2
-
-
-def test_comparisons_are_counted_where_they_are_made():
-    """The loop visits every candidate once, and nothing else; none for a map without edges."""
-    rng = np.random.default_rng(0)
-
-    @jax.jit
-    def visit(where):
-        def add(total, pixels, fetched):
-            return total.at[pixels].add(1.0 + fetched.astype(float), mode="drop")
-
-        return _compact.fold(where, jnp.zeros(9001), lambda pixels: pixels, add)
-
-    for share in (0.0, 0.001, 0.04, 0.5, 1.0):
-        where = jnp.asarray(rng.uniform(size=9001) < share)
-        visits = visit(where)
-        np.testing.assert_array_equal(visits, jnp.where(where, jnp.arange(1.0, 9002.0), 0))
-
-
-def test_chunks_run_as_many_as_there_are_candidates():
-    calls = []
-
-    def count(total, pixels, _):
-        jax.debug.callback(lambda: calls.append(1))
-        return total + jnp.sum(pixels < size)
-
-    size = 3 * _compact._CHUNK
-    for count_set, rounds in ((0, 0), (1, 1), (_compact._CHUNK, 1), (_compact._CHUNK + 1, 2)):
-        calls.clear()
-        where = jnp.arange(size) < count_set
-        assert _compact.fold(where, 0, lambda pixels: pixels, count) == count_set
-        jax.effects_barrier()
-        assert len(calls) == rounds
-
-
-@pytest.mark.parametrize(
-    ("shape", "size"), [((3, 3), 3), ((7, 9), 7), ((20, 23), 1), ((20, 23), 3), ((25, 23), 21)]
-)
-def test_running_extremes(shape, size):
-    image = np.random.default_rng(0).normal(size=shape)
-    smallest, largest = map(np.asarray, jax.jit(extremes, static_argnums=1)(image, size))
-    assert smallest.shape == largest.shape == tuple(side - size + 1 for side in shape)
-    for j, i in np.ndindex(*smallest.shape):
-        window = image[j : j + size, i : i + size]
-        assert (smallest[j, i], largest[j, i]) == (window.min(), window.max())
-    bits = (1 << (image > 0)).astype(np.uint8)
-    seen = (smallest <= 0) * 1 + (largest > 0) * 2
-    np.testing.assert_array_equal(unions(jnp.asarray(bits), size), seen)
 
 
 # The screen mask's losses: a wall at depth 2 with a floor at 4, seen at some magnification.

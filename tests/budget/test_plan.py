@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfx.budget._plan import Part, Search, timed
-from jaxfx.budget._tiles import spend, sums, tile_of
 
 
 class Way:
@@ -63,17 +62,3 @@ def test_every_way_is_called_once_before_it_is_timed_whatever_its_static_fields(
     for most in (1, 2, 2):
         timed(Steps(most), (jnp.ones(3),))
     assert called == [1, 1, 2, 2, 2]
-
-
-def test_tiles_hold_their_own_pixels_and_no_others():
-    image = np.random.default_rng(0).uniform(size=(19, 21))
-    found = sums(image.reshape(1, -1), tile_of((19, 21)))[:, 0]
-    rows = [image[i : i + 8, j : j + 8].sum() for i in (0, 8, 16) for j in (0, 8, 16)]
-    np.testing.assert_allclose(found, rows)
-
-
-def test_an_error_is_spent_on_the_cheapest_steps_in_their_order():
-    squares = np.array([[0, 1, 5, 6], [0, 2, 3, 30], [0, 0, 0, 9]], float)
-    for budget, steps in ((0, [0, 0, 2]), (1.1, [1, 0, 2]), (4.1, [1, 2, 2]), (9.1, [3, 2, 2])):
-        np.testing.assert_array_equal(spend(squares, budget**0.5, 1), steps)
-    assert squares[[0, 1, 2], spend(squares, 5.0, 2)].sum() <= 50
