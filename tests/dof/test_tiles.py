@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import Sprites, row_half_width, segment_integral
+from jaxfx.dof._sprites import Sprites
 from jaxfx.dof._tiles import TILE, _tile_reaches, tiles
 
 
@@ -71,20 +71,3 @@ def test_reaches_are_those_of_a_search():
     # By tiles, not by pixels: never less, and no farther than the farthest of all.
     assert (np.asarray(spread) >= destinations).all()
     assert np.asarray(spread).max() == far.max()
-
-
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_the_polynomial_is_the_arc(dtype):
-    radius = jnp.asarray([0.5, 0.7, 1.0, 3.3, 17.0, 64.0], dtype)
-    tolerance = 1e-6 if dtype == jnp.float32 else 1e-11
-    for row in range(5):
-        upper, lower = (
-            segment_integral(radius, jnp.asarray(abs(row + edge), dtype), True)
-            for edge in (0.5, -0.5)
-        )
-        sign = -1 if row == 0 else 1  # odd in the height
-        width, slope = (x - sign * y for x, y in zip(upper, lower, strict=True))
-        expected = row_half_width(radius, row)
-        slopes = jax.vmap(jax.grad(lambda r, row=row: row_half_width(r, row)))(radius)
-        np.testing.assert_allclose(width, expected, atol=tolerance * 64**2)
-        np.testing.assert_allclose(slope, slopes, atol=tolerance * 64)

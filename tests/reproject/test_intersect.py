@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from quick import quick_jit
-from reproject_cases import cliff, error_rate, posts, run, slanted_rays
+from reproject_cases import run, slanted_rays
 from reproject_failures import awkward_rays, field, grid_walk
 
 from jaxfx.reproject import _walk, intersect
@@ -76,44 +76,7 @@ def test_a_vertical_ray_meets_its_texel(method):
     np.testing.assert_allclose(hit.position, np.stack([x, y, depth], -1), atol=tolerance)
 
 
-def test_a_bound_on_steps_is_kept_and_said():
-    rng = np.random.default_rng(1)
-    depth = field((64, 64), rng)
-    origin, direction = awkward_rays((64, 64), rng)
-    free = run(depth, origin, direction)
-    bound = int(np.median(free.steps))
-    hit = run(depth, origin, direction, max_steps=bound)
-    np.testing.assert_array_equal(hit.exhausted, free.steps > bound)
-    assert hit.exhausted.any() and not (hit.mask & hit.exhausted).any()
-    np.testing.assert_array_equal(hit.steps, np.minimum(free.steps, bound))
-    within = ~np.asarray(hit.exhausted)
-    np.testing.assert_array_equal(hit.mask[within], free.mask[within])
-
-
 # The bilinear surface, and derivatives.
-
-
-# From view to grazing: at least so often the method errs on posts, and on a cliff.
-FAILURES = [
-    ("descent", None, posts, 4, 0.02),
-    ("descent", None, posts, 16, 0.1),
-    ("descent", None, cliff, 16, 0.05),
-    ("linear", 8, posts, 4, 0.02),
-    ("linear", 8, posts, 16, 0.1),
-    ("linear", 8, cliff, 16, 0.05),
-    ("relief", 8, posts, 16, 0.1),
-]
-
-
-@pytest.mark.parametrize(("method", "steps", "make", "slope", "least"), FAILURES)
-def test_where_a_quick_method_fails(method, steps, make, slope, least):
-    assert error_rate(make(48), slope, method, steps) > least
-
-
-@pytest.mark.parametrize("method", ["linear", "relief"])
-def test_more_steps_err_less(method):
-    rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 64)]
-    assert rates[0] > 2 * rates[1]
 
 
 def plane(size):

@@ -1,11 +1,12 @@
-"""The traversal alone: its packed state, and what a bound on its steps cuts short."""
+"""The traversal alone: its packed state, and a bound on its steps."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reproject_cases import posts, slanted_rays
+from reproject_cases import run
+from reproject_failures import awkward_rays, field
 
-from jaxfx.reproject._walk import level_of, pack, unpack, walk
+from jaxfx.reproject._walk import level_of, pack, unpack
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -22,14 +23,15 @@ def test_a_state_is_one_integer_that_keeps_all_five():
     np.testing.assert_array_equal(level_of(state), parts[2])
 
 
-def test_a_bound_cuts_the_rays_that_need_more_and_no_others():
-    depth, (origin, direction) = jnp.asarray(posts(48)), slanted_rays(48, 16)
-    origin, direction = (jnp.asarray(x).reshape(-1, 3) for x in (origin, direction))
-    free = walk(depth, origin, direction, None)
-    assert not free.exhausted.any()
-    for bound in (1, 12):
-        found, done = walk(depth, origin, direction, bound), np.asarray(free.steps) <= bound
-        np.testing.assert_array_equal(found.exhausted, ~done)
-        np.testing.assert_array_equal(found.mask, free.mask & done)
-        np.testing.assert_array_equal(np.where(done, found.time - free.time, 0), 0)
-        np.testing.assert_array_equal(found.steps, np.minimum(free.steps, bound))
+def test_a_bound_on_steps_is_kept_and_said():
+    rng = np.random.default_rng(1)
+    depth = field((64, 64), rng)
+    origin, direction = awkward_rays((64, 64), rng)
+    free = run(depth, origin, direction)
+    bound = int(np.median(free.steps))
+    hit = run(depth, origin, direction, max_steps=bound)
+    np.testing.assert_array_equal(hit.exhausted, free.steps > bound)
+    assert hit.exhausted.any() and not (hit.mask & hit.exhausted).any()
+    np.testing.assert_array_equal(hit.steps, np.minimum(free.steps, bound))
+    within = ~np.asarray(hit.exhausted)
+    np.testing.assert_array_equal(hit.mask[within], free.mask[within])
