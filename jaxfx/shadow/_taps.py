@@ -83,8 +83,12 @@ def checked(
 
 def without_gradient(kernel: Kernel, data: tuple[Any, ...]) -> Any:
     """What `checked` gave, constant where the filter is a step of it."""
-    is_step = data[-1] is None and kernel == "box"
-    return jax.lax.stop_gradient(data) if is_step else data
+    return jax.lax.stop_gradient(data) if is_step(kernel, data[-1]) else data
+
+
+def is_step(kernel: Kernel, softness: Any) -> bool:
+    """Whether a filter has no derivative anywhere."""
+    return softness is None and kernel == "box"
 
 
 def common_dtype(shadow_map: Array, receivers: Receivers) -> jnp.dtype:

@@ -149,8 +149,8 @@ def filtered(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
     texels = _taps.pad_map(shadow_map, size, dtype)
     places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
     result = average(texels, places, softness, size, kernel).astype(receivers.z.dtype)
-    if softness is None and kernel == "box":
-        return result  # a step, without a derivative
+    if _taps.is_step(kernel, softness):
+        return result
     # In memory, so that no tap's derivative adds up anew what a loss asks of the result.
     return apart(result, lambda: result)
 
