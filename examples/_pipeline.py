@@ -1,10 +1,10 @@
 """What `pipeline.py` needs but does not show: its search, its measures, its panels."""
 
 import argparse
-import io
 import statistics
 import time
 from collections.abc import Callable, Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import jax
 import matplotlib
 import numpy as np
 
-from jaxfx import exr
-from jaxfx.exr.layers import write_whole
+from jaxfx import io
+from jaxfx._files import write_whole
 
 
 matplotlib.use("Agg")
@@ -80,7 +80,7 @@ def print_table(columns: Mapping[str, Mapping[str, float]]) -> None:
 
 def shown(linear) -> np.ndarray:
     """A picture as a screen has it."""
-    return np.asarray(exr.srgb_from_linear(np.clip(np.asarray(linear), 0, 1)))
+    return np.asarray(io.srgb_from_linear(np.clip(np.asarray(linear), 0, 1)))
 
 
 def gray(difference, span: float | None = None) -> np.ndarray:
@@ -98,7 +98,7 @@ def write_panels(path: Path, images: Mapping[str, np.ndarray]) -> None:
     for ax, (title, image) in zip(axes.flat, images.items(), strict=False):
         ax.imshow(image, cmap="gray", vmin=0, vmax=1)
         ax.set_title(title, fontsize=10)
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     figure.savefig(buffer, dpi=90)
     plt.close(figure)
     write_whole(path, buffer.getvalue())

@@ -31,7 +31,7 @@ from atlas_cases import FENCE, HILLS, POSTS, SPIKES, STILL, Case, OnHost, Planne
 from tqdm.auto import tqdm
 
 from jaxfx import tradeoff
-from jaxfx.exr.layers import write_whole
+from jaxfx._files import write_whole
 
 
 matplotlib.use("Agg")

@@ -7,12 +7,12 @@ gradient, from a start that is wrong on purpose. Writes `reference.exr`, `fitted
 """
 
 import argparse
-import io
 import json
 import logging
 import math
 import os
 import time
+from io import BytesIO
 from pathlib import Path
 
 import jax
@@ -21,8 +21,8 @@ import matplotlib
 import numpy as np
 from _begin import fail, make_folder
 
-from jaxfx import ThinLens, dof, exr, fit, metrics, relight, reproject, scene, tradeoff
-from jaxfx.exr.layers import write_whole
+from jaxfx import ThinLens, dof, exr, fit, io, metrics, relight, reproject, scene, tradeoff
+from jaxfx._files import write_whole
 
 
 matplotlib.use("Agg")
@@ -147,7 +147,7 @@ def draw_chart(measurements, title: str, path: Path) -> None:
 def draw_fit(pictures: dict, losses, path: Path) -> None:
     figure, axes = plt.subplots(2, 3, figsize=(12, 8.4), layout="constrained")
     for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
-        ax.imshow(exr.srgb_from_linear(np.clip(np.asarray(picture), 0, 1)))
+        ax.imshow(io.srgb_from_linear(np.clip(np.asarray(picture), 0, 1)))
         ax.set_title(title)
         ax.set_axis_off()
     ax, losses = axes.flat[-1], np.asarray(losses)
@@ -163,7 +163,7 @@ def draw_fit(pictures: dict, losses, path: Path) -> None:
 
 
 def save(figure, path: Path) -> None:
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     figure.savefig(buffer, dpi=130)
     plt.close(figure)
     write_whole(path, buffer.getvalue())

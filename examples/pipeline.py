@@ -28,10 +28,10 @@ from _begin import fail, make_folder
 from jaxtyping import Array, Float
 
 from jaxfx import dof, fit, relight, reproject, scene, shadow
+from jaxfx._files import write_whole
 from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
-from jaxfx.exr.layers import write_whole
 from jaxfx.gbuffer import GBuffer
 from jaxfx.lens import ThinLens
 from jaxfx.light import AmbientLight, DirectionalLight

@@ -12,9 +12,9 @@ column.
 """
 
 import argparse
-import io
 import math
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -23,8 +23,8 @@ import numpy as np
 from _begin import fail, make_folder
 from tqdm.auto import tqdm
 
-from jaxfx import ThinLens, dof, exr
-from jaxfx.exr.layers import write_whole
+from jaxfx import ThinLens, dof, exr, io
+from jaxfx._files import write_whole
 
 
 matplotlib.use("Agg")
@@ -102,7 +102,7 @@ def read_color(path: Path) -> np.ndarray:
             raise ValueError(f"`{path}` must have channels R, G, B, got {[*channels]}.")
         image = channels[""].astype(np.float32)
     else:
-        image = exr.read_png(path)
+        image = io.read_png(path)
     return image[..., : 3 if image.shape[2] > 2 else 1]
 
 
@@ -182,7 +182,7 @@ def save_figure(pictures: dict, depth, missing, path: Path) -> None:
     )
     axes = list(axes.flat)
     for ax, (title, picture) in zip(axes[:1] + axes[2:], pictures.items(), strict=False):
-        ax.imshow(exr.srgb_from_linear(np.clip(picture, 0, 1)), cmap="gray")
+        ax.imshow(io.srgb_from_linear(np.clip(picture, 0, 1)), cmap="gray")
         ax.set_title(title)
     shown = axes[1].imshow(depth, cmap="viridis")
     figure.colorbar(shown, ax=axes[1], label="scene units")
@@ -192,7 +192,7 @@ def save_figure(pictures: dict, depth, missing, path: Path) -> None:
     axes[1].set_title(f"depth; {missing.mean():.0%} was missing, red")
     for ax in axes:
         ax.set_axis_off()
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     figure.savefig(buffer, dpi=110)
     plt.close(figure)
     write_whole(path, buffer.getvalue())
@@ -226,7 +226,7 @@ def main() -> None:
         image = np.asarray(METHODS[arguments.method](color, depth, lens, max_coc=max_coc))
         name = f"focus_{distance:.3g}"
         exr.write(out / f"{name}.exr", {"": image, "depth": depth, "coc": circles})
-        exr.write_png(out / f"{name}.png", image)
+        io.write_png(out / f"{name}.png", image)
         largest = min(max_coc, float(circles.max()))
         pictures[f"focus at {distance:.3g}, circles up to {largest:.0f} pixels"] = image
     save_figure(pictures, depth, np.isnan(measured), out / "refocus.png")

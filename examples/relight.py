@@ -22,8 +22,8 @@ import numpy as np
 from _begin import fail, make_folder
 from PIL import Image
 
-from jaxfx import PinholeCamera, SpotLight, exr, metrics, relight, reproject, scene, shadow
-from jaxfx.exr.layers import write_whole
+from jaxfx import PinholeCamera, SpotLight, io, metrics, relight, reproject, scene, shadow
+from jaxfx._files import write_whole
 
 
 matplotlib.use("Agg")
@@ -253,7 +253,7 @@ def psnr_to_fresh_cache(studio: Studio, image) -> float:
 
 
 def to_bytes(picture) -> np.ndarray:
-    return np.rint(255 * exr.srgb_from_linear(np.clip(picture, 0, 1))).astype(np.uint8)
+    return np.rint(255 * io.srgb_from_linear(np.clip(picture, 0, 1))).astype(np.uint8)
 
 
 def write_gif(pictures, path: Path) -> None:

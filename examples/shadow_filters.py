@@ -8,12 +8,12 @@ differs from the full one (`sizes.png`, `report.json`).
 """
 
 import argparse
-import io
 import json
 import logging
 import os
 import statistics
 import time
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +24,9 @@ import numpy as np
 from _begin import fail, make_folder
 from tqdm.auto import tqdm
 
-from jaxfx import AmbientLight, DirectionalLight, exr, relight, scene, shadow
+from jaxfx import AmbientLight, DirectionalLight, io, relight, scene, shadow
+from jaxfx._files import write_whole
 from jaxfx._sampling import pixel_centers
-from jaxfx.exr.layers import write_whole
 
 
 matplotlib.use("Agg")
@@ -78,7 +78,7 @@ class Stage(NamedTuple):
     def picture(self, visible) -> np.ndarray:
         """The picture under the shadow, as bytes."""
         linear = self.dark + np.asarray(visible)[..., None] * self.lit
-        return np.rint(255 * exr.srgb_from_linear(np.clip(linear, 0, 1))).astype(np.uint8)
+        return np.rint(255 * io.srgb_from_linear(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
 def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
@@ -205,7 +205,7 @@ def show(ax, image: np.ndarray, title: str) -> None:
 
 
 def save(figure, path: Path) -> None:
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     figure.savefig(buffer, dpi=110)
     plt.close(figure)
     write_whole(path, buffer.getvalue())

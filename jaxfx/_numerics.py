@@ -55,7 +55,7 @@ def check_image(name: str, image: Any) -> Array:
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(
             f"`{name}` must hold floats (linear radiance), got {array.dtype}. Convert an "
-            "8-bit picture with `jaxfx.exr.read_png`, which also undoes its sRGB curve."
+            "8-bit picture with `jaxfx.io.read_png`, which also undoes its sRGB curve."
         )
     return array
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from tqdm.auto import tqdm
 
 from jaxfx import metrics
-from jaxfx.exr.layers import StrPath, write_whole
+from jaxfx._files import StrPath, write_whole
 
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jaxfx import _sampling, blur, exr, relight, scene
+from jaxfx import _sampling, blur, io, relight, scene
 
 
 plt.rcParams.update({"figure.dpi": 80, "savefig.dpi": 80})
@@ -41,7 +41,7 @@ def show(pictures, columns=3, **options):
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
-        ax.imshow(exr.srgb_from_linear(np.clip(picture, 0, 1)), **options)
+        ax.imshow(io.srgb_from_linear(np.clip(picture, 0, 1)), **options)
         ax.set_title(title)
     plt.show()
 

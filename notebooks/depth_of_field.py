@@ -29,7 +29,7 @@ import numpy as np
 import trimesh
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
-from jaxfx import PinholeCamera, ThinLens, dof, exr, metrics, relight, scene, tradeoff
+from jaxfx import PinholeCamera, ThinLens, dof, io, metrics, relight, scene, tradeoff
 
 
 sys.path.append("../tests/benchmarks")
@@ -81,7 +81,7 @@ def show(pictures, columns, size):
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
-        screen = exr.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
+        screen = io.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
         ax.imshow(screen, interpolation="nearest")
         ax.set_title(title, fontsize=9)
     plt.show()
@@ -232,7 +232,7 @@ for name, second in (("one layer", None), ("two layers", hidden)):
         for t in thresholds
     ]
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
-left.imshow(exr.srgb_from_linear(np.clip(np.asarray(trials[1][1]), 0, 1)))
+left.imshow(io.srgb_from_linear(np.clip(np.asarray(trials[1][1]), 0, 1)))
 left.set_axis_off()
 left.set_title("what the threshold was chosen on", fontsize=9)
 for name, curve in curves.items():

@@ -33,8 +33,8 @@ from jaxfx import (
     PinholeCamera,
     PointLight,
     SpotLight,
-    exr,
     fit,
+    io,
     relight,
     scene,
     shadow,
@@ -53,7 +53,7 @@ def show(**pictures):
         1, len(pictures), figsize=(4 * len(pictures), 3.2), layout="constrained"
     )
     for axis, (name, image) in zip(axes, pictures.items(), strict=True):
-        axis.imshow(np.clip(exr.srgb_from_linear(np.asarray(image)), 0, 1))
+        axis.imshow(np.clip(io.srgb_from_linear(np.asarray(image)), 0, 1))
         axis.set(title=name.replace("_", " "), xticks=[], yticks=[])
     plt.show()
 

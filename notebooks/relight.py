@@ -18,10 +18,10 @@
 # scene's.
 
 # %%
-import io
 import statistics
 import sys
 import time
+from io import BytesIO
 from pathlib import Path
 
 import jax
@@ -32,7 +32,7 @@ from IPython.display import Image as Picture, display
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 from PIL import Image
 
-from jaxfx import GBuffer, PinholeCamera, PointLight, exr, metrics, relight, scene
+from jaxfx import GBuffer, PinholeCamera, PointLight, io, metrics, relight, scene
 
 
 # The scenes that the benchmarks use, whichever folder this runs in.
@@ -43,7 +43,7 @@ import relight_scenes
 
 set_matplotlib_formats("jpeg", pil_kwargs={"quality": 80})
 plt.rcParams |= {"figure.dpi": 80, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}
-show = lambda image: np.asarray(exr.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
+show = lambda image: np.asarray(io.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
 
 
 def pictures(titled, columns, width=10):
@@ -163,7 +163,7 @@ def picture(x, y, z, strength):
     """The picture with the light there, as JPEG."""
     color = np.array([1.0, 0.85, 0.6], np.float32) * strength
     light = PointLight(np.array([x, y, z], np.float32), color)
-    stream = io.BytesIO()
+    stream = BytesIO()
     pixels = np.asarray(to_bytes(live.edit(2, light).image))
     Image.fromarray(pixels).save(stream, "JPEG", quality=85)
     return stream.getvalue()

@@ -29,7 +29,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
-from jaxfx import ThinLens, dof, exr, metrics, reproject, scene, tradeoff
+from jaxfx import ThinLens, dof, io, metrics, reproject, scene, tradeoff
 from jaxfx._pyramid import minimum_pyramid
 from jaxfx.reproject import _grid, _walk
 
@@ -53,7 +53,7 @@ def hatched(drawn, alpha):
 
 
 def show(ax, picture, title=""):
-    screen = exr.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
+    screen = io.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
     ax.imshow(screen, interpolation="nearest")
     ax.set_title(title, fontsize=9)
     ax.set_axis_off()

@@ -29,7 +29,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
-from jaxfx import AmbientLight, DirectionalLight, PointLight, exr, fit, relight, scene, shadow
+from jaxfx import AmbientLight, DirectionalLight, PointLight, fit, io, relight, scene, shadow
 
 
 # The scenes that the tests and benchmarks use, whichever folder this runs in.
@@ -63,7 +63,7 @@ dark = np.asarray(relight.render(gbuffer, still.eye, [AmbientLight([0.2, 0.21, 0
 
 
 def shaded(visible, mark=None):
-    image = exr.srgb_from_linear(np.clip(dark + np.asarray(visible)[..., None] * lit, 0, 1))
+    image = io.srgb_from_linear(np.clip(dark + np.asarray(visible)[..., None] * lit, 0, 1))
     if mark is None:
         return image
     grey = 0.4 + 0.6 * image.mean(axis=-1, keepdims=True)

@@ -24,7 +24,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 NUMERICS = {"_filter", "_linear", "_numerics", "_tiles", "_pyramid", "_sampling"}
 TYPES = {"camera", "lens", "light", "gbuffer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
-HOST = {"scene", "exr"}
+HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}
 
 MAY_IMPORT = (

@@ -26,7 +26,7 @@ import jaxfx.shadow
 
 # Not functions of arrays: the host side reads files and meshes; solvers, measurements and plans
 # run Python until they are done. Each of these states what it can do in its own tests.
-NOT_TRANSFORMED = {"scene", "exr", "fit", "tradeoff", "budget"}
+NOT_TRANSFORMED = {"scene", "exr", "io", "fit", "tradeoff", "budget"}
 
 # Nor functions of pictures: they give parameters, or no floats at all.
 NO_PICTURES = {"shadow.candidates", "shadow.light_cameras"}

@@ -1,7 +1,7 @@
-"""Pictures in files: OpenEXR for linear data, PNG for screens.
+"""Pictures and deep frame buffers in OpenEXR files.
 
-The file boundary, on the host: NumPy in and out. sRGB exists only here, in the PNG functions;
-an EXR file holds linear numbers and keeps them to the bit.
+The file boundary, on the host: NumPy in and out. An EXR file holds linear numbers and keeps
+them to the bit; `jaxfx.io` has the formats for screens.
 
 Blender and Nuke know a channel by the last letter of its name, so the shape of an array and
 its key choose the letters:
@@ -29,16 +29,11 @@ any case and after any dot: `left.Normal`.
 
 from jaxfx.exr.frame import read_gbuffer, write_gbuffer
 from jaxfx.exr.layers import read, write
-from jaxfx.exr.png import linear_from_srgb, read_png, srgb_from_linear, write_png
 
 
 __all__ = [
-    "linear_from_srgb",
     "read",
     "read_gbuffer",
-    "read_png",
-    "srgb_from_linear",
     "write",
     "write_gbuffer",
-    "write_png",
 ]

@@ -3,17 +3,16 @@
 import contextlib
 import io
 import os
-import secrets
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfx._files import StrPath, write_whole
 
-StrPath = str | os.PathLike[str]
+
 MAX_PIXELS = 2**28
 
 _VECTORS = {"normal", "position", "direction", "tangent", "velocity", "motion", "vector"}
@@ -25,23 +24,6 @@ _CHUNK = 16
 # the first one as it stands in a file, before the four bytes of its value.
 _CHECKSUM, _VERSION = "jaxfx.crc32", "jaxfx.version"
 _SEAL = _CHECKSUM.encode() + b"\0int\0" + (4).to_bytes(4, "little")
-
-
-def write_whole(path: StrPath, data: bytes | bytearray | memoryview) -> None:
-    """Write a file whole or not at all: beside the old one, then into its place."""
-    target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
-    try:
-        temporary.touch(exist_ok=False)
-    except OSError as error:
-        reason = f"cannot write `{target.name}` here, {error.strerror}"
-        raise OSError(error.errno, reason, str(target.parent)) from error
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def _storable(name: str, array: np.ndarray) -> np.ndarray:

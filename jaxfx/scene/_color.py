@@ -1,12 +1,9 @@
-"""The sRGB curve, and reads of byte textures."""
+"""Reads of byte textures, as stored or undone of their sRGB curve."""
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-
-def linear_from_srgb(value: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Linear light of sRGB values in [0, 1]. Source: IEC 61966-2-1."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+from jaxfx.io import linear_from_srgb
 
 
 _BYTES = np.arange(256) / 255

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxfx.scene._color import linear_from_srgb
+from jaxfx.io import linear_from_srgb
 from jaxfx.scene._scene import Material, Scene
 
 

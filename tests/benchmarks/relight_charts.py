@@ -6,7 +6,7 @@
 
 import argparse
 import csv
-import io
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ import relight_truth as truth
 from matplotlib import pyplot as plt
 from PIL import Image
 
-from jaxfx import Transfer, exr, metrics, relight, scene
+from jaxfx import Transfer, io, metrics, relight, scene
 
 
 SIZE = (72, 96)
@@ -23,14 +23,14 @@ SAMPLES = 512
 
 
 def shown(ax, title, image):
-    ax.imshow(exr.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
+    ax.imshow(io.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
     ax.set_title(title, fontsize=9)
     ax.set_axis_off()
 
 
 def save(figure, path):
     """As a picture of 128 colours, which is small."""
-    stream = io.BytesIO()
+    stream = BytesIO()
     figure.savefig(stream, format="png", dpi=120)
     Image.open(stream).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxfx import DirectionalLight, PointLight, SpotLight, scene, shadow
 from jaxfx._sampling import pixel_centers
-from jaxfx.scene._color import linear_from_srgb
+from jaxfx.io import linear_from_srgb
 
 
 mi.set_variant("scalar_rgb")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxfx import exr
+from jaxfx import exr, io
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -31,13 +31,13 @@ def photograph(tmp_path, monkeypatch):
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     pattern = np.where((x + y) % 2, 0.9, 0.1)
     color = np.stack([pattern, pattern, np.where(is_card(), 0.8, 0.2)], axis=-1)
-    exr.write_png("color.png", color)
+    io.write_png("color.png", color)
     depth = np.where(is_card(), NEAR, FAR)
     exr.write("depth.exr", {"depth": depth.astype(np.float32)})
     millimetres = (1000 * depth).astype(np.uint16)
     millimetres[10:20, 8:12] = 0
     Image.fromarray(millimetres).save("depth.png")
-    return exr.read_png("color.png")
+    return io.read_png("color.png")
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_what_is_in_focus_is_sharp_and_the_rest_is_not(photograph, main):
     assert contrast(far[""], card) < 0.3 * before
     # The lens' own formula: aperture times focal length times the difference of 1 / depth.
     np.testing.assert_allclose(near["coc"][wall], 0.2 * 40 * (1 / NEAR - 1 / FAR), rtol=1e-3)
-    shown = exr.read_png("out/focus_1.png")
+    shown = io.read_png("out/focus_1.png")
     np.testing.assert_allclose(shown, near[""].clip(0, 1), atol=0.01)
 
 

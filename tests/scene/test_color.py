@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxfx.scene._color import LINEAR, SRGB, linear_from_srgb, read_texture
+from jaxfx.io import linear_from_srgb
+from jaxfx.scene._color import LINEAR, SRGB, read_texture
 
 
 def test_srgb_curve():

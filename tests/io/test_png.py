@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from skimage.color import rgb2xyz
 
-from jaxfx import exr
+from jaxfx import io
 
 
 COLOR_TYPES = {1: 0, 2: 4, 3: 2, 4: 6}
@@ -55,14 +55,14 @@ def test_the_curve_against_scikit_image():
     codes = np.linspace(0, 1, 1001)
     # The luminance of a grey is its linear value.
     expected = rgb2xyz(np.stack([codes] * 3, axis=-1))[:, 1]
-    np.testing.assert_allclose(exr.linear_from_srgb(codes), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(io.linear_from_srgb(codes), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_the_curve_and_its_inverse(dtype):
     codes = np.linspace(-0.5, 2, 5001).astype(dtype)
-    light = exr.linear_from_srgb(codes)
-    back = exr.srgb_from_linear(light)
+    light = io.linear_from_srgb(codes)
+    back = io.srgb_from_linear(light)
     assert light.dtype == back.dtype == dtype
     # At the joint the two pieces of the standard miss each other by 3e-8.
     np.testing.assert_allclose(back, codes, rtol=20 * np.finfo(dtype).eps, atol=1e-7)
@@ -71,7 +71,7 @@ def test_the_curve_and_its_inverse(dtype):
 
 def test_the_curve_at_known_points():
     points = np.array([-0.001, 0.0, 0.0031308, 0.18, 1.0])
-    codes = exr.srgb_from_linear(points)
+    codes = io.srgb_from_linear(points)
     np.testing.assert_allclose(codes, [-0.01292, 0, 0.04045, 0.461356, 1], atol=5e-7)
 
 
@@ -82,7 +82,7 @@ def test_read_any_depth_and_colour(tmp_path, channels, dtype):
     largest = np.iinfo(dtype).max
     codes = np.random.default_rng(0).integers(0, largest + 1, (11, 7, channels), dtype)
     path.write_bytes(png(codes))
-    image = exr.read_png(path)
+    image = io.read_png(path)
     assert image.dtype == np.float32
     np.testing.assert_allclose(image, linear(codes, largest), rtol=3e-7)
 
@@ -91,13 +91,13 @@ def test_read_any_depth_and_colour(tmp_path, channels, dtype):
 def test_every_code_comes_back(tmp_path, channels):
     codes = np.arange(256 * channels).reshape(16, 16, channels) % 256
     path = tmp_path / "a.png"
-    exr.write_png(path, linear(codes, 255))
+    io.write_png(path, linear(codes, 255))
     with Image.open(path) as picture:
         np.testing.assert_array_equal(np.asarray(picture).reshape(codes.shape), codes)
-    once = exr.read_png(path)
+    once = io.read_png(path)
     np.testing.assert_allclose(once, linear(codes, 255), rtol=3e-7)
     before = path.read_bytes()
-    exr.write_png(path, once)
+    io.write_png(path, once)
     assert path.read_bytes() == before
 
 
@@ -105,13 +105,13 @@ def test_write_clips_and_rounds(tmp_path):
     """To the nearest code, half a code each way; nothing wraps around."""
     half = linear(np.array([[[100.49], [100.51]]]), 255)
     bad = np.array([[[-1.0], [7.0], [np.inf], [-np.inf], [np.nan]]])
-    exr.write_png(tmp_path / "a.png", np.concatenate([half, bad], axis=1))
+    io.write_png(tmp_path / "a.png", np.concatenate([half, bad], axis=1))
     with Image.open(tmp_path / "a.png") as picture:
         assert np.asarray(picture).tolist() == [[100, 101, 0, 255, 255, 0, 0]]
 
 
 def test_alpha_is_linear(tmp_path):
-    exr.write_png(tmp_path / "a.png", np.full((1, 1, 4), 0.5, np.float32))
+    io.write_png(tmp_path / "a.png", np.full((1, 1, 4), 0.5, np.float32))
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.getpixel((0, 0)) == (188, 188, 188, 128)
 
@@ -121,46 +121,46 @@ def test_palettes_and_single_bits(tmp_path):
     codes = np.array([[[0, 10, 200], [255, 0, 3]]], np.uint8)
     picture = Image.fromarray(codes).quantize(4)
     picture.save(path)
-    np.testing.assert_allclose(exr.read_png(path), linear(codes, 255), rtol=3e-7)
+    np.testing.assert_allclose(io.read_png(path), linear(codes, 255), rtol=3e-7)
     picture.save(path, transparency=bytes([0, 128, 255, 255]))
-    image = exr.read_png(path)
+    image = io.read_png(path)
     assert image.shape == (1, 2, 4)
     np.testing.assert_allclose(image[..., :3], linear(codes, 255), rtol=3e-7)
     Image.fromarray(np.array([[True, False]])).save(path)
-    np.testing.assert_array_equal(exr.read_png(path), [[[1], [0]]])
+    np.testing.assert_array_equal(io.read_png(path), [[[1], [0]]])
 
 
 def test_write_takes_any_layout(tmp_path):
     image = np.random.default_rng(0).random((6, 5, 3))
-    exr.write_png(tmp_path / "a.png", image)
-    exr.write_png(tmp_path / "b.png", np.asfortranarray(image)[::-1].copy()[::-1])
+    io.write_png(tmp_path / "a.png", image)
+    io.write_png(tmp_path / "b.png", np.asfortranarray(image)[::-1].copy()[::-1])
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 @pytest.mark.parametrize("shape", [(4, 5), (0, 5, 3), (4, 5, 0), (4, 5, 5)])
 def test_errors_of_shape(tmp_path, shape):
     with pytest.raises(ValueError, match=r"`write_png\(image\)` must hold floats of shape"):
-        inspect.unwrap(exr.write_png)(tmp_path / "a.png", np.zeros(shape))
+        inspect.unwrap(io.write_png)(tmp_path / "a.png", np.zeros(shape))
     assert not list(tmp_path.iterdir())
 
 
 def test_errors_of_type_and_folder(tmp_path):
     with pytest.raises(ValueError, match=r"`write_png\(image\)` must hold floats .* got uint8"):
-        inspect.unwrap(exr.write_png)(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8))
+        inspect.unwrap(io.write_png)(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8))
     with pytest.raises(FileNotFoundError, match=r"cannot write `a.png` here"):
-        exr.write_png(tmp_path / "no" / "a.png", np.zeros((4, 5, 3)))
+        io.write_png(tmp_path / "no" / "a.png", np.zeros((4, 5, 3)))
 
 
 def test_files_that_are_not_png(tmp_path):
     path = tmp_path / "a.png"
     with pytest.raises(FileNotFoundError):
-        exr.read_png(path)
+        io.read_png(path)
     path.touch()
     with pytest.raises(ValueError, match=r"a.png` is damaged or not PNG"):
-        exr.read_png(path)
+        io.read_png(path)
     Image.fromarray(np.zeros((4, 5, 3), np.uint8)).save(path, "JPEG")
     with pytest.raises(ValueError, match=r"a.png` is damaged or not PNG"):
-        exr.read_png(path)
+        io.read_png(path)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -174,7 +174,7 @@ def test_mutated_files_raise_or_keep_their_shape(tmp_path, dtype):
         flipped = data[:at] + bytes([data[at] ^ 1 << rng.integers(8)]) + data[at + 1 :]
         path.write_bytes(data[:at] if i % 2 else flipped)
         try:
-            image = exr.read_png(path)
+            image = io.read_png(path)
         except ValueError as error:
             assert str(path) in str(error)
             raised += 1

@@ -3,13 +3,13 @@
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfx.exr.layers import StrPath, write_whole
+from jaxfx._files import StrPath, write_whole
+from jaxfx.io._pixels import png_values
 
 
 def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -90,7 +90,7 @@ def read_png(path: StrPath) -> Float[np.ndarray, "height width channel"]:
     """
     data = Path(path).read_bytes()
     try:
-        values = _png_values(data)
+        values = png_values(data)
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
     return _recolor(linear_from_srgb, values).astype(np.float32)
@@ -100,27 +100,3 @@ def _recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> n
     """`curve` on the colours of an image, not on its alpha."""
     colors = 3 if values.shape[2] > 2 else 1
     return np.concatenate([curve(values[:, :, :colors]), values[:, :, colors:]], axis=2)
-
-
-def _png_values(data: bytes) -> np.ndarray:
-    """The numbers of a PNG file, height width channel, over their largest."""
-    from PIL import Image
-
-    def pixels(layout: str = "") -> np.ndarray:
-        picture: Any = Image.open(io.BytesIO(data), formats=("PNG",))
-        if layout:
-            picture.tile = [(*picture.tile[0][:3], layout)]
-        palette = "RGBA" if "transparency" in picture.info else "RGB"
-        mode = {"1": "L", "P": palette}.get(picture.mode, picture.mode)
-        array = np.asarray(picture.convert(mode), np.float64)
-        return array.reshape(*array.shape[:2], -1)
-
-    # Of 16-bit colours Pillow keeps the high bytes. It gives the low ones when asked for the
-    # other byte order, and both of grey and alpha as the four channels of RGBA.
-    layout = Image.open(io.BytesIO(data), formats=("PNG",)).tile[0][3]
-    if layout == "LA;16B":
-        high_low = pixels("RGBA")
-        return (256 * high_low[:, :, ::2] + high_low[:, :, 1::2]) / 65535
-    if layout in ("RGB;16B", "RGBA;16B"):
-        return (256 * pixels() + pixels(layout[:-1] + "L")) / 65535
-    return pixels() / (65535 if layout == "I;16B" else 255)
