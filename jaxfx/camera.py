@@ -257,3 +257,13 @@ class OrthographicCamera(eqx.Module):
         plane = plane / self.pixels_per_unit.astype(pixels.dtype)
         local = jnp.concatenate([plane, depth[..., None]], axis=-1)
         return _to_world(self.world_from_camera, local)
+
+
+def at_origin(camera: Any) -> Any:
+    """A camera of either kind, turned as it is, at the world's origin.
+
+    For what does not depend on where it stands: a difference of two points far away from the
+    origin would have few digits left.
+    """
+    pose = camera.world_from_camera.at[:3, 3].set(0)
+    return eqx.tree_at(lambda camera: camera.world_from_camera, camera, pose)

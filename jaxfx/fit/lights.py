@@ -95,7 +95,8 @@ def lights(
     **Arguments:**
 
     - `reference`: height width 3, linear radiance.
-    - `gbuffer`, `camera`: as in `relight.shade`.
+    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing (0, negative, NaN)
+      a pixel has no say.
     - `lights`: their number and kinds, and where the search starts; colours count only if they
       are not fitted.
     - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
@@ -121,7 +122,7 @@ def lights(
     Source: the elimination of the linear unknowns is Golub & Pereyra 1973; that the colours of
     lights are a linear problem, Schoeneman et al. 1993.
     """
-    reference = _reference(reference, gbuffer)
+    reference, gbuffer = _known(_reference(reference, gbuffer), gbuffer)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
     for name, value in (("rounds", rounds), ("max_steps", max_steps)):
@@ -170,6 +171,14 @@ def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
     if not bool(jnp.isfinite(reference).all()):
         raise ValueError("`lights(reference)` must be finite, got a NaN or inf pixel.")
     return reference.astype(gbuffer.color.dtype)
+
+
+def _known(reference: Array, gbuffer: GBuffer) -> tuple[Array, GBuffer]:
+    """Both black where the depth is missing: such a pixel has no say."""
+    missing = ~(gbuffer.depth > 0)
+    shader = jnp.where(missing, -1, gbuffer.shader)
+    gbuffer = eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
+    return jnp.where(missing[..., None], 0, reference), gbuffer
 
 
 def _start(lights: Any) -> tuple[Light, ...]:

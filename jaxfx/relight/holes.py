@@ -16,6 +16,8 @@ def fill_holes(
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """What `synthesize` left open, taken from the nearest pixel that a cache covers.
 
+    Pixels without a depth (inf, or missing: 0, negative, NaN) stay as they are.
+
     **Arguments:** `gbuffer`, `coverage`: height width, both from `synthesize`.
 
     **Returns:** the `GBuffer`, which keeps its depth; and the number of pixels filled, an
@@ -40,7 +42,7 @@ def fill_holes(
 @jax.jit
 def _fill(gbuffer, coverage):
     covered = coverage > 0
-    hole = ~covered & jnp.isfinite(gbuffer.depth)
+    hole = ~covered & (gbuffer.depth > 0) & jnp.isfinite(gbuffer.depth)
     found, near = _nearest(covered, hole)
     hole &= found
     height, width = covered.shape

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import check_depth, normalize, safe_divide
+from jaxfx._numerics import normalize, safe_divide
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
@@ -52,14 +52,15 @@ def synthesize(
     - `gbuffers`, `cameras`: the caches, height width each, of any sizes, and their cameras.
     - `target`: the new camera.
     - `depth`: height width, of the new view, scene units along its axis, inf for background:
-      from the mesh, or from the caches' own depths, warped.
+      from the mesh, or from the caches' own depths, warped. Where it is 0, negative or NaN it
+      is missing: such a pixel is as background.
     - `tolerance`: static; of the depth. It must cover the error of the depths.
     - `angle`: static; radians.
     - `weights`: "equal" is the source's mean; "detail" favours the nearer and more frontal
       camera, by the pixels that it spends on a unit of the surface.
 
     **Returns:** the `GBuffer`, its normals averaged on the sphere, its depth the one given; and
-    the coverage, height width, integers. A pixel of finite depth with coverage 0 is a hole: see
+    the coverage, height width, integers. A pixel of known depth with coverage 0 is a hole: see
     `fill_holes`. Holes and background have shader -1 and zeros. A NaN in a cache reaches only
     the pixels that read it.
 
@@ -164,12 +165,17 @@ def _check(caller: str, gbuffers: Any, cameras: Any) -> None:
 
 
 def _check_target(caller: str, depth: Any) -> Scalars:
-    shape = jnp.shape(depth)
-    if len(shape) != 2 or 0 in shape:
+    depth = jnp.asarray(depth)
+    if depth.ndim != 2 or 0 in depth.shape:
         raise ValueError(
-            f"`{caller}(depth=...)` must have shape (height, width), neither 0, got {shape}."
+            f"`{caller}(depth=...)` must have shape (height, width), neither 0, "
+            f"got {depth.shape}."
         )
-    return check_depth(f"{caller}(depth=...)", depth, shape)
+    if not jnp.issubdtype(depth.dtype, jnp.floating):
+        raise ValueError(
+            f"`{caller}(depth=...)` must hold floats (scene units), got {depth.dtype}."
+        )
+    return depth
 
 
 @partial(jax.jit, static_argnames=("tolerance", "angle", "weights"))
@@ -196,8 +202,8 @@ def _synthesize(gbuffers, cameras, target, depth, *, tolerance, angle, weights):
         out = jnp.zeros_like(values[0])
         for value, part in zip(values, shares, strict=True):
             share = part.reshape(part.shape + (1,) * (out.ndim - 2))
-            # What has no share may not be finite.
-            out = out + jnp.where(share > 0, share * value, 0)
+            # What has no share may not be finite, nor be multiplied by a derivative's 0.
+            out = out + share * jnp.where(share > 0, value, 0)
         return out
 
     def read(name):

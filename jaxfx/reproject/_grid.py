@@ -140,6 +140,6 @@ def entry(r: Rays, height: int, width: int) -> Entry:
 
 
 def _beyond(edge: Array, backward: Array, cell: Array, has_passed: Array) -> Array:
-    """The row or column at the image's edge or, past it, a later one, whatever rounding says."""
+    """The row or column at the edge of the image or, past it, one inside, whatever rounding."""
     inner = jnp.where(backward == 1, jnp.minimum(cell, edge), jnp.maximum(cell, edge))
     return jnp.where(has_passed, inner, edge)

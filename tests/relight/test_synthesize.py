@@ -335,8 +335,8 @@ def test_errors_name_the_argument():
         synthesize([gbuffer], CAMERAS, TARGET, depth=depth)
     with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must have shape"):
         synthesize([gbuffer], [TARGET], TARGET, depth=depth[0])
-    with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must be positive"):
-        synthesize([gbuffer], [TARGET], TARGET, depth=-depth)
+    with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must hold floats"):
+        synthesize([gbuffer], [TARGET], TARGET, depth=np.ones((HEIGHT, WIDTH), int))
     for name, value in (("tolerance", 0.0), ("angle", -1.0)):
         with pytest.raises(ValueError, match=rf"`synthesize\({name}=...\)` must be positive"):
             synthesize([gbuffer], [TARGET], TARGET, depth=depth, **{name: value})
