@@ -3,7 +3,8 @@ from pathlib import Path
 
 import jax
 import pytest
-from quick import quickly
+
+from tests.helpers.quick import quickly
 
 
 jax.config.update("jax_enable_x64", True)
