@@ -62,7 +62,7 @@ def forget_programs():
 
 @pytest.fixture(autouse=True, scope="session")
 def quick_by_default(is_full):
-    """The quick form of the suite compiles with little optimisation, the full one as users do."""
+    """Compile with little optimisation in the quick form, as users do in the full one."""
     with contextlib.nullcontext() if is_full else compiling.quickly():
         yield
 
