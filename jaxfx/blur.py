@@ -12,6 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfx._checks import check, check_image, parameter
 from jaxfx._filter import (
     Sampling,
     added,
@@ -21,7 +22,7 @@ from jaxfx._filter import (
     linear_reads,
     separable,
 )
-from jaxfx._numerics import check, check_image, parameter, working_dtype
+from jaxfx._numerics import working_dtype
 
 
 __all__ = ["binomial_weights", "downsample", "gaussian", "linear_taps"]

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, normalize, parameter
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import normalize
 
 
 __all__ = ["OrthographicCamera", "PinholeCamera"]

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import parameter
+from jaxfx._checks import parameter
 
 
 __all__ = ["GBuffer", "Transfer"]

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, parameter
+from jaxfx._checks import check, parameter
 
 
 __all__ = ["AmbientLight", "DirectionalLight", "Light", "PointLight", "SpotLight"]

@@ -11,7 +11,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import check, check_image, is_concrete, parameter, working_dtype
+from jaxfx._checks import check, check_image, is_concrete, parameter
+from jaxfx._numerics import working_dtype
 
 
 __all__ = ["psnr", "ssim"]

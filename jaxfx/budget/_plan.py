@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import is_concrete
+from jaxfx._checks import is_concrete
 
 
 # How far a way may err on parts of a scene to be measured on all of it: first the quickest that

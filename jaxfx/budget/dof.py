@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfx._numerics import check_depth, check_image
+from jaxfx._checks import check_depth, check_image
 from jaxfx.budget._octaves import octaves
 from jaxfx.budget._plan import Part, Plan, Search, Trial, check_call, plan
 from jaxfx.dof.blend import blend

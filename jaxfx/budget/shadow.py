@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import parameter
+from jaxfx._checks import parameter
 from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
 from jaxfx.shadow import _taps

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import check_depth, check_image, working_dtype
+from jaxfx._checks import check_depth, check_image
+from jaxfx._numerics import working_dtype
 from jaxfx.dof.scatter import largest_coc
 from jaxfx.lens import FocusPlanes, ThinLens
 

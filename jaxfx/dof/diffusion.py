@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, parameter
+from jaxfx._checks import check, parameter
 from jaxfx.dof._inputs import Defocused, check_arguments, defocused
 from jaxfx.lens import FocusPlanes, ThinLens
 

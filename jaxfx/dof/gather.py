@@ -8,7 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import absolute, check, clip01, parameter
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import absolute, clip01
 from jaxfx._sampling import bilinear, pixel_centers
 from jaxfx.dof._discs import POISSON, vogel
 from jaxfx.dof._inputs import check_arguments, check_count, defocused

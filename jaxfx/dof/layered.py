@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import check, check_depth, check_image, clip01, parameter, sum_planes
+from jaxfx._checks import check, check_depth, check_image, parameter
+from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof._sheets import composited
 from jaxfx.dof._shift import shift

@@ -10,14 +10,8 @@ from jax.custom_batching import sequential_vmap
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import (
-    check,
-    check_depth,
-    check_image,
-    is_concrete,
-    parameter,
-    working_dtype,
-)
+from jaxfx._checks import check, check_depth, check_image, is_concrete, parameter
+from jaxfx._numerics import working_dtype
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import absolute, check, parameter
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import absolute
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof._sprites import POINT_RADIUS, coverage, leak_rejection, reach
 from jaxfx.lens import FocusPlanes, ThinLens

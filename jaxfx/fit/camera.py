@@ -13,7 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from tqdm.auto import tqdm
 
-from jaxfx._numerics import check_image, safe_divide
+from jaxfx._checks import check_image
+from jaxfx._numerics import safe_divide
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
-from jaxfx._numerics import check, check_depth, check_image, parameter
+from jaxfx._checks import check, check_depth, check_image, parameter
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import largest_coc, scatter
 from jaxfx.fit._descent import End, Solver, descend, standard_errors

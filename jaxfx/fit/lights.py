@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
-from jaxfx._numerics import check_image, parameter
+from jaxfx._checks import check_image, parameter
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
 from jaxfx.fit._lighting import (

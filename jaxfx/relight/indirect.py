@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import parameter, working_dtype
+from jaxfx._checks import parameter
+from jaxfx._numerics import working_dtype
 from jaxfx.gbuffer import GBuffer, Transfer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight.shading import Surface, checked, received

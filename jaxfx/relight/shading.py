@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import check, clip01, normalize, parameter, safe_divide, working_dtype
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import parameter, safe_divide
+from jaxfx._checks import parameter
+from jaxfx._numerics import safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light

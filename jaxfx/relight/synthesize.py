@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import check_depth, normalize, safe_divide
+from jaxfx._checks import check_depth
+from jaxfx._numerics import normalize, safe_divide
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer

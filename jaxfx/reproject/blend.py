@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import check_image, normalize, safe_divide, sum_planes, working_dtype
+from jaxfx._checks import check_image
+from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.reproject._rays import Camera

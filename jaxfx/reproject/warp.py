@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check_image, working_dtype
+from jaxfx._checks import check_image
+from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.reproject._rays import Camera

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import absolute, check, parameter, working_dtype
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import absolute, working_dtype
 from jaxfx.shadow.receivers import Receivers
 
 

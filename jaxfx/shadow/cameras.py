@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, normalize, parameter
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import normalize
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
 

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxfx._numerics import is_concrete
+from jaxfx._checks import is_concrete
 from jaxfx.shadow import _taps
 from jaxfx.shadow._masked import find_mask, masked
 from jaxfx.shadow._taps import Kernel

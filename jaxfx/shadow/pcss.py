@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import absolute, check, clip01, parameter, safe_divide
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import absolute, clip01, safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.shadow import _taps
 from jaxfx.shadow.pcf import read

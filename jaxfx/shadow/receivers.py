@@ -8,14 +8,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import (
-    absolute,
-    normalize,
-    parameter,
-    safe_divide,
-    safe_sqrt,
-    working_dtype,
-)
+from jaxfx._checks import parameter
+from jaxfx._numerics import absolute, normalize, safe_divide, safe_sqrt, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 

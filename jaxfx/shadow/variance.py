@@ -8,7 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, parameter, safe_divide
+from jaxfx._checks import check, parameter
+from jaxfx._numerics import safe_divide
 from jaxfx._sampling import bilinear
 from jaxfx.shadow import _taps
 from jaxfx.shadow.receivers import Receivers
