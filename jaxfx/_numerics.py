@@ -12,11 +12,15 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 
+def common_dtype(*dtypes: DTypeLike) -> jnp.dtype:
+    """The widest of `dtypes`, asked for by name, so allowed where promotion is strict."""
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.result_type(*dtypes)
+
+
 def working_dtype(*dtypes: DTypeLike) -> jnp.dtype:
     """The type that images of `dtypes` are computed in: the widest, float32 at least."""
-    # Asked for by name, so allowed where promotion is strict.
-    with jax.numpy_dtype_promotion("standard"):
-        return jnp.result_type(*dtypes, jnp.float32)
+    return common_dtype(*dtypes, jnp.float32)
 
 
 @jax.custom_jvp

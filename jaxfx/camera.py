@@ -1,16 +1,27 @@
 """Cameras: x right, y down, z forward; poses are `world_from_camera`."""
 
-from typing import Any, final
+from collections.abc import Sequence
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Num
 
-from jaxfx._checks import check, parameter
-from jaxfx._numerics import normalize
+from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
+from jaxfx._numerics import common_dtype, normalize, working_dtype
 
 
-__all__ = ["OrthographicCamera", "PinholeCamera"]
+__all__ = ["Camera", "OrthographicCamera", "PinholeCamera"]
+
+# Points, pixels and depths as people have them: arrays, numbers and lists, integers too.
+_Points = Num[ArrayLike, "... 3"] | Sequence[Any]
+_Pixels = Num[ArrayLike, "... 2"] | Sequence[Any]
+_Depths = Num[ArrayLike, "..."] | Sequence[Any]
+
+# How far a rotation's columns may be from orthonormal: files hold four digits.
+_ORTHONORMAL = 1e-3
 
 
 def _each(vector: Float[Array, " n"], like: Float[Array, "... n"]) -> Float[Array, "... n"]:
@@ -41,6 +52,47 @@ def _to_camera(
     return _transformed(pose[:3, :3].T, points - _each(pose[:3, 3], points))
 
 
+def _pose(name: str, value: Any) -> Float[Array, "4 4"]:
+    """A rigid motion."""
+    pose = parameter(name, value, (4, 4))
+    room = max(_ORTHONORMAL, 8 * float(jnp.finfo(pose.dtype).eps))
+
+    def is_rigid(numbers):
+        turn, last = numbers[:3, :3].astype(np.float64), numbers[3]
+        is_turn = np.abs(turn.T @ turn - np.eye(3)).max() < room and np.linalg.det(turn) > 0
+        return is_turn and np.isfinite(numbers).all() and (last == [0, 0, 0, 1]).all()
+
+    check(name, pose, is_rigid, "a rotation and a finite position over the row 0 0 0 1")
+    return pose
+
+
+def _read_points(camera: Any, method: str, points: Any, size: int) -> Array:
+    """World points or pixels, in a float type; `ValueError` names what is none."""
+    name = f"{method}({'points' if size == 3 else 'pixels'})"
+    check_fields(f"{type(camera).__name__}.{method}", camera)
+    points = parameter(name, points, None)
+    if points.shape[-1:] != (size,):
+        raise ValueError(f"`{name}` must have shape (..., {size}), got {points.shape}.")
+    return points
+
+
+def _read_pixels(camera: Any, pixels: Any, depth: Any) -> tuple[Array, Array, Any]:
+    """Pixels and depths that fit, in the type to compute in; and the type of the result."""
+    pixels = _read_points(camera, "unproject", pixels, 2)
+    depth = parameter("unproject(depth)", depth, None)
+    try:
+        shape = jnp.broadcast_shapes(pixels.shape[:-1], depth.shape)
+    except ValueError:
+        raise ValueError(
+            f"`unproject(depth)` must have the pixels' shape {pixels.shape[:-1]}, "
+            f"got {depth.shape}."
+        ) from None
+    dtype = common_dtype(pixels.dtype, depth.dtype)
+    working = working_dtype(dtype)
+    pixels = jnp.broadcast_to(pixels.astype(working), (*shape, 2))
+    return pixels, jnp.broadcast_to(depth.astype(working), shape), dtype
+
+
 def _look_at_pose(eye: Any, target: Any, up: Any) -> Float[Array, "4 4"]:
     eye = parameter("look_at(eye)", eye, (3,))
     target = parameter("look_at(target)", target, (3,))
@@ -60,45 +112,62 @@ class PinholeCamera(eqx.Module):
 
     **Arguments:**
 
-    - `intrinsics`: 3x3, from camera axes to pixels (focal lengths and principal point in
-      pixels, last row 0 0 1).
-    - `world_from_camera`: 4x4 rigid pose; its rotation is taken to be orthonormal.
+    - `intrinsics`: 3x3, from camera axes to pixels (focal lengths, positive, and principal
+      point in pixels, last row 0 0 1).
+    - `world_from_camera`: 4x4 rigid pose: an orthonormal rotation and a position.
 
-    **Raises:** `ValueError` for a wrong shape.
+    **Raises:** `ValueError` for a wrong shape, for intrinsics that are not finite or of another
+    form, and for a pose with a scale, a shear or a mirror in it. Traced values can't be looked
+    at: what such a pose shows is not what `unproject` gives.
 
     **Gradient:** exact with respect to both fields. The pose is not projected back onto the
     rigid motions: parametrize it, by a twist say, to stay on them.
     """
 
+    SHAPES: ClassVar = {"intrinsics": (3, 3), "world_from_camera": (4, 4)}
+
     intrinsics: Float[Array, "3 3"]
     world_from_camera: Float[Array, "4 4"]
 
     def __init__(self, intrinsics: Any, world_from_camera: Any):
-        self.intrinsics = parameter("PinholeCamera(intrinsics)", intrinsics, (3, 3))
-        self.world_from_camera = parameter(
-            "PinholeCamera(world_from_camera)", world_from_camera, (4, 4)
+        name = "PinholeCamera(intrinsics)"
+        self.intrinsics = parameter(name, intrinsics, (3, 3))
+        check(
+            name,
+            self.intrinsics,
+            lambda v: np.isfinite(v).all() & (np.diag(v) > 0).all() & (v[2] == [0, 0, 1]).all(),
+            "finite, with positive focal lengths and the last row 0 0 1",
         )
+        self.world_from_camera = _pose("PinholeCamera(world_from_camera)", world_from_camera)
 
     @classmethod
     def from_fov(
-        cls, fov_y: Any, *, height: int, width: int, world_from_camera: Any | None = None
+        cls,
+        fov_y: Any,
+        *,
+        height: WholeNumber,
+        width: WholeNumber,
+        world_from_camera: Any | None = None,
     ) -> "PinholeCamera":
         """Square pixels and a centred principal point.
 
         **Arguments:**
 
         - `fov_y`: vertical field of view, in radians, between 0 and pi.
-        - `height`, `width`: image size in pixels.
+        - `height`, `width`: static; image size in pixels.
         - `world_from_camera`: the 4x4 pose; the identity by default.
 
         **Returns:** the camera.
 
-        **Raises:** `ValueError` for a field of view out of range.
+        **Raises:** `ValueError` for a field of view out of range, a size that is no positive
+        integer or a pose that is not rigid.
 
         **Gradient:** exact in `fov_y`.
         """
         fov_y = parameter("from_fov(fov_y)", fov_y)
         check("from_fov(fov_y)", fov_y, lambda v: (v > 0) & (v < jnp.pi), "in (0, pi) radians")
+        height = whole_number("from_fov(height=...)", height)
+        width = whole_number("from_fov(width=...)", width)
         focal = height / (2 * jnp.tan(fov_y / 2))
         zero, one = jnp.zeros_like(focal), jnp.ones_like(focal)
         rows = [
@@ -112,7 +181,14 @@ class PinholeCamera(eqx.Module):
 
     @classmethod
     def look_at(
-        cls, eye: Any, target: Any, *, up: Any, fov_y: Any, height: int, width: int
+        cls,
+        eye: Any,
+        target: Any,
+        *,
+        up: Any,
+        fov_y: Any,
+        height: WholeNumber,
+        width: WholeNumber,
     ) -> "PinholeCamera":
         """The camera at `eye` that has `target` at the middle of its picture.
 
@@ -131,40 +207,45 @@ class PinholeCamera(eqx.Module):
         pose = _look_at_pose(eye, target, up)
         return cls.from_fov(fov_y, height=height, width=width, world_from_camera=pose)
 
-    def project(
-        self, points: Float[Array, "... 3"]
-    ) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
+    def project(self, points: _Points) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
         """Pixels and depth of world points.
 
-        **Arguments:** `points`: world positions, `... 3`, in scene units.
+        **Arguments:** `points`: world positions, `... 3`, in scene units, floats or integers.
 
         **Returns:** `pixels`, `... 2`, as (x, y) with centres at +0.5; and `depth`, `...`,
-        along the optical axis. A point behind the camera has a negative depth, and its pixels
-        are those of the line through the eye.
+        along the optical axis, both in the type of `points`, of integers in JAX's default float
+        type. A point behind the camera has a negative depth, and its pixels are those of the
+        line through the eye.
+
+        **Raises:** `ValueError` for a wrong shape, what is no array of numbers, or a batch of
+        cameras.
 
         **Gradient:** exact; infinite where the depth is 0.
         """
-        points = jnp.asarray(points)
-        local = _to_camera(self.world_from_camera, points)
+        points = _read_points(self, "project", points, 3)
+        dtype = points.dtype
+        local = _to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         depth = local[..., 2]
         scaled = _transformed(self.intrinsics, local)
-        return scaled[..., :2] / depth[..., None], depth
+        return (scaled[..., :2] / depth[..., None]).astype(dtype), depth.astype(dtype)
 
-    def unproject(
-        self, pixels: Float[Array, "... 2"], depth: Float[Array, "..."]
-    ) -> Float[Array, "... 3"]:
+    def unproject(self, pixels: _Pixels, depth: _Depths) -> Float[Array, "... 3"]:
         """World points of pixels at a depth: the inverse of `project`.
 
-        **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis.
+        **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis;
+        floats or integers, one depth for several pixels or the other way round.
 
-        **Returns:** world positions, `... 3`. Infinite depth gives non-finite points.
+        **Returns:** world positions, `... 3`, in the wider type of the two, of integers in
+        JAX's default float type. Infinite depth gives non-finite points.
+
+        **Raises:** `ValueError` as `project`, and for a depth that does not fit the pixels.
 
         **Gradient:** exact.
         """
-        pixels, depth = jnp.asarray(pixels), jnp.asarray(depth)
+        pixels, depth, dtype = _read_pixels(self, pixels, depth)
         homogeneous = jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
         rays = _transformed(jnp.linalg.inv(self.intrinsics), homogeneous)
-        return _to_world(self.world_from_camera, rays * depth[..., None])
+        return _to_world(self.world_from_camera, rays * depth[..., None]).astype(dtype)
 
     def through_lens(self, offset: Any, *, focus_distance: Any) -> "PinholeCamera":
         """The off-axis camera at a point of the lens whose focus plane stays where it is.
@@ -208,10 +289,13 @@ class OrthographicCamera(eqx.Module):
     - `centre`: 2, the pixel (x, y) of the optical axis.
     - `world_from_camera`: 4x4 rigid pose.
 
-    **Raises:** `ValueError` for a wrong shape or a scale that is not positive.
+    **Raises:** `ValueError` for a wrong shape, a number that is not finite, a scale that is not
+    positive, or a pose that is not rigid.
 
     **Gradient:** exact with respect to every field.
     """
+
+    SHAPES: ClassVar = {"pixels_per_unit": (), "centre": (2,), "world_from_camera": (4, 4)}
 
     pixels_per_unit: Float[Array, ""]
     centre: Float[Array, "2"]
@@ -220,41 +304,51 @@ class OrthographicCamera(eqx.Module):
     def __init__(self, pixels_per_unit: Any, centre: Any, world_from_camera: Any):
         name = "OrthographicCamera(pixels_per_unit)"
         self.pixels_per_unit = parameter(name, pixels_per_unit)
-        check(name, self.pixels_per_unit, lambda v: v > 0, "positive")
+        check(name, self.pixels_per_unit, lambda v: (v > 0) & (v < np.inf), "positive")
         self.centre = parameter("OrthographicCamera(centre)", centre, (2,))
-        self.world_from_camera = parameter(
-            "OrthographicCamera(world_from_camera)", world_from_camera, (4, 4)
+        check("OrthographicCamera(centre)", self.centre, np.isfinite, "finite")
+        self.world_from_camera = _pose(
+            "OrthographicCamera(world_from_camera)", world_from_camera
         )
 
-    def project(
-        self, points: Float[Array, "... 3"]
-    ) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
+    def project(self, points: _Points) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
         """Pixels and depth of world points.
 
-        **Arguments:** `points`: world positions, `... 3`, in scene units.
+        **Arguments:** `points`: world positions, `... 3`, in scene units, floats or integers.
 
-        **Returns:** `pixels`, `... 2`, (x, y); `depth`, `...`, along the optical axis.
+        **Returns:** `pixels`, `... 2`, (x, y); `depth`, `...`, along the optical axis; both in
+        the type of `points`, of integers in JAX's default float type.
+
+        **Raises:** `ValueError` for a wrong shape, what is no array of numbers, or a batch of
+        cameras.
 
         **Gradient:** exact.
         """
-        points = jnp.asarray(points)
-        local = _to_camera(self.world_from_camera, points)
-        pixels = local[..., :2] * self.pixels_per_unit.astype(points.dtype)
-        return pixels + _each(self.centre, pixels), local[..., 2]
+        points = _read_points(self, "project", points, 3)
+        dtype = points.dtype
+        local = _to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
+        pixels = local[..., :2] * self.pixels_per_unit.astype(local.dtype)
+        pixels = pixels + _each(self.centre, pixels)
+        return pixels.astype(dtype), local[..., 2].astype(dtype)
 
-    def unproject(
-        self, pixels: Float[Array, "... 2"], depth: Float[Array, "..."]
-    ) -> Float[Array, "... 3"]:
+    def unproject(self, pixels: _Pixels, depth: _Depths) -> Float[Array, "... 3"]:
         """World points of pixels at a depth: the inverse of `project`.
 
-        **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis.
+        **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis;
+        floats or integers, one depth for several pixels or the other way round.
 
-        **Returns:** world positions, `... 3`.
+        **Returns:** world positions, `... 3`, in the wider type of the two, of integers in
+        JAX's default float type.
+
+        **Raises:** `ValueError` as `project`, and for a depth that does not fit the pixels.
 
         **Gradient:** exact.
         """
-        pixels, depth = jnp.asarray(pixels), jnp.asarray(depth)
+        pixels, depth, dtype = _read_pixels(self, pixels, depth)
         plane = pixels - _each(self.centre, pixels)
         plane = plane / self.pixels_per_unit.astype(pixels.dtype)
         local = jnp.concatenate([plane, depth[..., None]], axis=-1)
-        return _to_world(self.world_from_camera, local)
+        return _to_world(self.world_from_camera, local).astype(dtype)
+
+
+Camera = PinholeCamera | OrthographicCamera

@@ -117,6 +117,8 @@ def test_working_dtype(given, expected):
     for promotion in ("strict", "standard"):
         with jax.numpy_dtype_promotion(promotion):
             assert _numerics.working_dtype(*given) == expected
+            assert _numerics.common_dtype(*given, jnp.float32) == expected
+            assert _numerics.common_dtype(given[0]) == given[0]
 
 
 def test_every_helper_is_tested():
