@@ -51,6 +51,14 @@ def as_array(name: str, value: Any) -> Array:
     return read
 
 
+def as_numpy(name: str, value: Any) -> np.ndarray:
+    """What `as_array` reads, on the host and in full: for files."""
+    array = np.asarray(value if isinstance(value, jax.Array) else _from_outside(name, value))
+    if array.dtype.kind == "c":
+        raise _not_real(name, array)
+    return array
+
+
 def _not_real(name: str, array: Any) -> ValueError:
     what = "hold real numbers" if array.ndim else "be a real number"
     return ValueError(f"`{name}` must {what}, got {array.dtype}.")

@@ -49,6 +49,17 @@ def test_arrays_of_other_kinds():
     np.testing.assert_array_equal(traced, [1, 2])
 
 
+def test_as_numpy_keeps_what_jax_would_cut():
+    for value in (np.array([2**40]), np.array([1e300]), np.array([0.5], ">f8")):
+        found = _checks.as_numpy("f(x)", value)
+        assert isinstance(found, np.ndarray)
+        assert found.dtype.isnative
+        np.testing.assert_array_equal(found, value)
+    np.testing.assert_array_equal(_checks.as_numpy("f(x)", jnp.ones(2)), [1, 1])
+    with pytest.raises(ValueError, match=r"`f\(x\)` must hold real numbers, got complex128"):
+        _checks.as_numpy("f(x)", np.array([1j]))
+
+
 class Unreadable:
     def __array__(self, *_, **__):
         raise RuntimeError("on another device")
