@@ -5,17 +5,20 @@ Types live here; effects live in their modules: `jaxfx.dof`. The host side, `jax
 `jaxfx.exr`, is imported when it is asked for.
 """
 
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer, Transfer
-from jaxfx.lens import FocusPlanes, ThinLens
-from jaxfx.light import AmbientLight, DirectionalLight, PointLight, SpotLight
+from jaxfx.lens import FocusPlanes, Lens, ThinLens
+from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
 
 
 __all__ = [
     "AmbientLight",
+    "Camera",
     "DirectionalLight",
     "FocusPlanes",
     "GBuffer",
+    "Lens",
+    "Light",
     "OrthographicCamera",
     "PinholeCamera",
     "PointLight",

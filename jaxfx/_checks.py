@@ -40,7 +40,7 @@ def as_array(name: str, value: Any) -> Array:
     kinds = (jnp.bool_, jnp.integer, jnp.floating)
     if not any(jnp.issubdtype(array.dtype, kind) for kind in kinds):
         raise _not_real(name, array)
-    read = jnp.asarray(array)
+    read = _converted(array)
     if jnp.issubdtype(read.dtype, jnp.integer) and read.dtype.itemsize < array.dtype.itemsize:
         held = np.iinfo(read.dtype)
         if array.size and not held.min <= array.min() <= array.max() <= held.max:
@@ -49,6 +49,14 @@ def as_array(name: str, value: Any) -> Array:
                 f"{array.min()} to {array.max()}."
             )
     return read
+
+
+def _converted(array: Any, dtype: Any = None) -> Array:
+    """A JAX array of a type; of what can be looked at one that can be, inside a trace too."""
+    if not is_concrete(array):
+        return jnp.asarray(array, dtype)
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(array, dtype)
 
 
 def as_numpy(name: str, value: Any) -> np.ndarray:
@@ -108,7 +116,7 @@ def parameter(
     if array.dtype == jnp.bool_ and not booleans:
         raise _not_real(name, array)
     if not jnp.issubdtype(array.dtype, jnp.floating) or array.weak_type:
-        array = jnp.asarray(array, dtype=jnp.result_type(float))
+        array = _converted(array, jnp.result_type(float))
     if shape is not None:
         check_shape(name, array, shape)
     return array

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
-from jaxfx._checks import check, check_fields, parameter
+from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
 from jaxfx._numerics import absolute, clip01, working_dtype
 from jaxfx.camera import PinholeCamera
 
@@ -144,8 +144,14 @@ class ThinLens(eqx.Module):
 
         **Returns:** the lens.
 
+        **Raises:** `ValueError` for a camera that is no pinhole, or as `ThinLens`.
+
         **Gradient:** exact, in the camera's focal length too.
         """
+        if not isinstance(camera, PinholeCamera):
+            kind = type(camera).__name__
+            raise ValueError(f"`from_camera(camera)` must be a PinholeCamera, got {kind}.")
+        check_fields("from_camera(camera)", camera)
         intrinsics = camera.intrinsics
         return cls(aperture, focus_distance, jnp.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))
 
@@ -184,10 +190,12 @@ class ThinLens(eqx.Module):
                 "`from_physical(aperture=..., f_number=...)` must be given one of the two, "
                 f"got {'neither' if aperture is None else 'both'}."
             )
-        focal_length = parameter("from_physical(focal_length=...)", focal_length)
+        name = "from_physical(focal_length=...)"
+        focal_length = _finite(name, focal_length, _positive, "positive")
         name = "from_physical(focus_distance=...)"
         distance = parameter(name, focus_distance)
-        scale = parameter("from_physical(pixels_per_unit=...)", pixels_per_unit)
+        name_of_scale = "from_physical(pixels_per_unit=...)"
+        scale = _finite(name_of_scale, pixels_per_unit, _positive, "positive")
         margin = distance - focal_length
         check(
             name,
@@ -196,8 +204,55 @@ class ThinLens(eqx.Module):
             "beyond `focal_length` (focus_distance - focal_length > 0)",
         )
         if aperture is None:
-            aperture = focal_length / parameter("from_physical(f_number=...)", f_number)
-        return cls(aperture, distance, focal_length * distance / margin * scale)
+            name = "from_physical(f_number=...)"
+            aperture = focal_length / _finite(name, f_number, _positive, "positive")
+        # A quotient that focus at infinity has as well.
+        image_distance = focal_length / (1 - focal_length / distance)
+        return cls(aperture, distance, image_distance * scale)
+
+    @classmethod
+    def from_sensor(
+        cls,
+        focal_length: Any,
+        f_stop: Any,
+        focus_distance: Any,
+        sensor_width: Any,
+        width: WholeNumber,
+    ) -> "ThinLens":
+        """A lens that stays where it is when it focuses, as Blender's does.
+
+        A real lens moves away from the sensor to focus nearer, and so shows less of the scene,
+        larger: `from_physical`, by a factor of `focus_distance / (focus_distance -
+        focal_length)`, 2 % at 2.6 m for 50 mm. Blender's sensor stays at the focal length.
+
+        **Arguments:**
+
+        - `focal_length`, `focus_distance`, `sensor_width`: lengths, all in one unit. Blender's
+          are in millimetres, but for the distance.
+        - `f_stop`: the ratio of the focal length to the aperture.
+        - `width`: static; pixels along the side that `sensor_width` fits: of Blender's "AUTO",
+          the longer one.
+
+        **Returns:** the lens: `focal_pixels` is `focal_length / sensor_width * width`, and
+        `aperture` is `focal_length / f_stop`.
+
+        **Raises:** `ValueError` for a number that is not positive.
+
+        **Gradient:** exact.
+
+        Source: Blender's Cycles, whose lens is `focal_length / (2 f_stop)` in radius and whose
+        rays through a pixel meet in the plane in focus.
+        """
+        focal_length, f_stop, sensor_width = (
+            _finite(f"from_sensor({name})", value, _positive, "positive")
+            for name, value in (
+                ("focal_length", focal_length),
+                ("f_stop", f_stop),
+                ("sensor_width", sensor_width),
+            )
+        )
+        width = whole_number("from_sensor(width)", width)
+        return cls(focal_length / f_stop, focus_distance, focal_length / sensor_width * width)
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
         """The lens' factor of the defocus, never negative, and the depth's, with the sign."""
@@ -291,12 +346,13 @@ class FocusPlanes(eqx.Module):
         valid = _all_positive(focus - near, far - focus) & (max_coc >= 0)
         # Beyond the planes nothing changes; an infinite quotient would have a NaN derivative.
         depth = jnp.where(depth >= far, far, jnp.where(depth <= near, near, depth))
-        ahead = clip01((focus - depth) / (focus - near))
+        is_ahead = depth < focus
+        ahead = clip01((focus - jnp.where(is_ahead, depth, focus)) / (focus - near))
         ends = far < jnp.inf
         behind = jnp.where(ends, depth - focus, 0) / jnp.where(ends, far - focus, 1)
         behind = clip01(behind)
         scale = jnp.where(valid, max_coc, jnp.nan)
-        return scale, jnp.where(depth < focus, -ahead, behind)
+        return scale, jnp.where(is_ahead, -ahead, behind)
 
     def defocus(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Signed diameter of the circle of confusion.

@@ -60,6 +60,22 @@ def test_as_numpy_keeps_what_jax_would_cut():
         _checks.as_numpy("f(x)", np.array([1j]))
 
 
+@pytest.mark.parametrize(
+    "value", [NUMBERS, NUMBERS.tolist(), jnp.full((2, 2), 4.0), np.arange(3), jnp.arange(3)]
+)
+def test_what_a_trace_closes_over_can_be_looked_at(value):
+    seen = []
+
+    @jax.jit
+    def traced(x):
+        seen.append(_checks.is_concrete(_checks.parameter("f(x)", value, None)))
+        seen.append(_checks.is_concrete(_checks.as_array("f(x)", value)))
+        return x
+
+    traced(1.0)
+    assert seen == [True, True]
+
+
 class Unreadable:
     def __array__(self, *_, **__):
         raise RuntimeError("on another device")

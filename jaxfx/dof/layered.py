@@ -97,7 +97,9 @@ def layered(
     return _layered(image, depth, lens, max_coc, second, threshold)
 
 
-def _second_layer(image: Array, depth: Array, lens: Any, behind: Any) -> tuple[Array, ...]:
+def _second_layer(
+    image: Array, depth: Array, lens: Any, behind: Any
+) -> tuple[Array, Array, Any]:
     """The second layer's image, its depth and the lens for it; `ValueError` names a fault."""
     name = "layered(behind=...)"
     pair = items(name, behind, "a pair of an image and its depth")
