@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._numerics import parameter
+from jaxfx._checks import Number, WholeNumber
 from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
 from jaxfx.shadow import _taps
@@ -93,13 +93,13 @@ def _at(size, pixels, shadow_map, receivers, bias, slope_bias):
 
 
 def shadow(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float = 0.0,
     slope_bias: Float[ArrayLike, ""] | float = 0.0,
-    max_error: int | float,
+    max_error: Number,
 ) -> Plan:
     """The quickest shadow within an error of `shadow.pcf` with a filter of `size`.
 
@@ -127,10 +127,9 @@ def shadow(
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    biases = (
-        parameter("shadow(bias=...)", bias),
-        parameter("shadow(slope_bias=...)", slope_bias),
-    )
+    given = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)
+    shadow_map, receivers = given[:2]
+    biases, size = (given[2], given[3]), int(size)
     where = candidates(
         shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1], mask="depth"
     ).where

@@ -9,9 +9,11 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import absolute, check, parameter, working_dtype
+from jaxfx._checks import check, check_map, option, parameter, whole_number
+from jaxfx._numerics import absolute, working_dtype
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -49,36 +51,38 @@ def checked(
     kernel: Any = "box",
 ) -> tuple[Any, ...]:
     """The five arguments that the filters share, as arrays; `ValueError` names a wrong one."""
-    shadow_map = jnp.asarray(shadow_map)
-    if shadow_map.ndim != 2 or 0 in shadow_map.shape:
+    shadow_map = check_map(f"{function}(shadow_map)", shadow_map)
+    if not isinstance(receivers, Receivers):
+        kind = type(receivers).__name__
         raise ValueError(
-            f"`{function}(shadow_map)` must have shape (height, width), neither of them 0, "
-            f"got {shadow_map.shape}. Batches are made with `jax.vmap`."
+            f"`{function}(receivers)` must be what `receivers` gave, got a {kind}."
         )
-    fields = [jnp.asarray(field) for field in receivers]
+    fields = [
+        parameter(f"{function}(receivers.{name})", field, None)
+        for name, field in zip(Receivers._fields, receivers, strict=True)
+    ]
     for name, field in zip(Receivers._fields, fields, strict=True):
         if field.shape != fields[0].shape or field.ndim != 2 or 0 in field.shape:
             raise ValueError(
                 f"`{function}(receivers)` must hold images of one shape (height, width), "
                 f"got {field.shape} for `{name}`."
             )
-    for name, field in (("shadow_map", shadow_map), ("receivers", fields[0])):
-        if not jnp.issubdtype(field.dtype, jnp.floating):
-            raise ValueError(f"`{function}({name})` must hold floats, got {field.dtype}.")
-    if isinstance(size, bool) or not isinstance(size, int) or size < 1 or size % 2 == 0:
-        raise ValueError(
-            f"`{function}(size=...)` must be an odd number of texels from 1, got {size!r}."
-        )
-    if kernel not in get_args(Kernel):
-        raise ValueError(
-            f"`{function}(kernel=...)` must be one of {get_args(Kernel)}, got {kernel!r}."
-        )
+    check_size(f"{function}(size=...)", size)
+    option(f"{function}(kernel=...)", kernel, get_args(Kernel))
     bias = parameter(f"{function}(bias=...)", bias)
     slope_bias = parameter(f"{function}(slope_bias=...)", slope_bias)
+    for name, number in (("bias", bias), ("slope_bias", slope_bias)):
+        check(f"{function}({name}=...)", number, np.isfinite, "finite")
     if softness is not None:
         softness = parameter(f"{function}(softness=...)", softness)
         check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
     return shadow_map, Receivers(*fields), bias, slope_bias, softness
+
+
+def check_size(name: str, size: Any, least: int = 1) -> int:
+    """The width of a filter, odd, in texels; `ValueError` otherwise."""
+    is_odd = lambda n: n >= least and n % 2 == 1
+    return whole_number(name, size, is_odd, f"an odd number of texels from {least}")
 
 
 def without_gradient(kernel: Kernel, data: tuple[Any, ...]) -> Any:

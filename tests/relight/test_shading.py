@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from relight_views import FRONT, REFLECTANCES, one_pixel, sun
 
 from jaxfx import (
     AmbientLight,
@@ -20,6 +18,8 @@ from jaxfx import (
     SpotLight,
     relight,
 )
+from tests.cases.relight_views import FRONT, REFLECTANCES, one_pixel, sun
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -302,6 +302,7 @@ def test_gradients_of_render_equal_finite_differences():
     np.testing.assert_allclose(forward.sum(), expected, rtol=1e-7)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_reverse_memory_does_not_grow_with_the_lights():
     size = 64
     gbuffer = make_gbuffer(0, size, size, background=False)

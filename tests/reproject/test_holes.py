@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
+from tests.helpers.quick import quick_jit
 
 from jaxfx import OrthographicCamera, PinholeCamera
 from jaxfx.reproject import blend, choose, intersect, warp

@@ -41,7 +41,7 @@ def orthographic(matrix, distance, dtype):
 
 
 def on_plane(matrix, distance, is_orthographic):
-    """Where the source sees the points of a plane across its axis that a target sees; or not."""
+    """Where the source sees what a target sees of a plane across its axis; and whether it does."""
     across = np.stack([(X - WIDTH / 2) / FOCAL, (Y - HEIGHT / 2) / FOCAL], axis=-1)
     if is_orthographic:
         begin = distance * np.concatenate([across, np.zeros_like(across[..., :1])], axis=-1)
