@@ -113,6 +113,17 @@ def at_origin(camera: Any) -> Any:
     return eqx.tree_at(lambda camera: camera.world_from_camera, camera, pose)
 
 
+def per_depth(camera: Any, pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
+    """How far rays through pixels lead in the world, for each unit of depth.
+
+    Of no two points of a ray: those of a scene of 1e6 differ by a unit of depth in few digits.
+    """
+    turn, pixels = camera.world_from_camera[:3, :3], homogeneous(pixels)
+    if hasattr(camera, "intrinsics"):
+        return transformed(turn, transformed(jnp.linalg.inv(camera.intrinsics), pixels))
+    return each(turn[:, 2], pixels)
+
+
 def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
     """Pixels with a one."""
     return jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)

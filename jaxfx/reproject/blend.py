@@ -13,7 +13,7 @@ from jaxfx._checks import Number, WholeNumber, check_image, items, whole_number
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
-from jaxfx.camera._rigid import at_origin
+from jaxfx.camera._rigid import per_depth
 from jaxfx.reproject._rays import Camera
 from jaxfx.reproject._view import View, look
 from jaxfx.reproject.intersect import Method
@@ -213,7 +213,7 @@ class Sight(eqx.Module):
         """The view, the cosine between the source's rays and the target's, and its depth."""
         pixels = self.pixels.astype(depth.dtype)
         view = look(depth, source, self.target, pixels, **self.options)
-        rays, others = _rays(source, view.pixels), _rays(self.target, pixels)
+        rays, others = per_depth(source, view.pixels), per_depth(self.target, pixels)
         cosine = jnp.sum(normalize(rays) * normalize(others), axis=-1)
         # No point of the world: its square overflows where a sky is at 1e20.
         at_infinity = view.inverse_depth <= 0
@@ -225,9 +225,3 @@ class Sight(eqx.Module):
         )
         there = along / jnp.where(at_infinity, 1, view.inverse_depth) + offset
         return view, jnp.maximum(cosine, 0), jnp.where(at_infinity, jnp.inf, there)
-
-
-def _rays(camera: Camera, pixels: Float[Array, "ray 2"]) -> Float[Array, "ray 3"]:
-    """How far a camera's rays lead in the world, for each unit of depth."""
-    camera, one = at_origin(camera), jnp.ones_like(pixels[:, 0])
-    return camera.unproject(pixels, one) - camera.unproject(pixels, 0 * one)

@@ -14,7 +14,7 @@ from jaxfx._checks import check, check_map, items, parameter
 from jaxfx._numerics import absolute, normalize, safe_divide, safe_sqrt, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
-from jaxfx.camera._rigid import at_origin
+from jaxfx.camera._rigid import at_origin, per_depth
 
 
 _Image = Float[Array, "height width"]
@@ -145,8 +145,8 @@ def _axes(camera: Camera, pixels: Float[Array, "height width 2"], z: _Image):
     camera, zero = at_origin(camera), jnp.zeros_like(pixels)
     right, down = (zero.at[..., axis].set(1) for axis in (0, 1))
     start = camera.unproject(zero, z)
-    ray = camera.unproject(pixels, jnp.ones_like(z)) - camera.unproject(pixels, z * 0)
-    return camera.unproject(right, z) - start, camera.unproject(down, z) - start, ray
+    sides = camera.unproject(right, z) - start, camera.unproject(down, z) - start
+    return *sides, per_depth(camera, pixels)
 
 
 def _dot(one: _Vectors, other: _Vectors) -> _Image:

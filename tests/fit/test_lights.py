@@ -4,6 +4,7 @@ import functools
 import inspect
 import re
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -246,6 +247,20 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
         )
     spread = np.std(misses, axis=0)
     assert ((spread > 0.7) & (spread < 1.3)).all(), spread
+
+
+@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan])
+def test_a_pixel_whose_depth_is_missing_has_no_say(missing):
+    gbuffer, lights = cache(), TRUTH[:2]
+    reference = relight.render(gbuffer, CAMERA, lights)
+    lost = np.zeros((SIZE, SIZE), bool)
+    lost[3:9, 12:20] = lost[20, 20] = True
+    holed = eqx.tree_at(lambda g: g.depth, gbuffer, jnp.where(lost, missing, gbuffer.depth))
+    wrong = jnp.where(lost[..., None], 7.0, reference)
+    start = [WRONG[0][0], WRONG[0][1]]
+    found = quietly(wrong, holed, start)
+    assert found.success
+    assert_close(found.lights, lights, 1e-3)
 
 
 FAULTS = {
