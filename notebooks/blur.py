@@ -102,8 +102,8 @@ for _ in range(5):
     print(f"{float(sigma):.5f}", end="  ")
 
 # %% [markdown]
-# The tap count is static, and what given taps can't hold is dropped: 9 taps give a standard deviation
-# of 2.58 pixels at the most, that of equal weights. More passes hold more.
+# The tap count is static, and what given taps can't hold is dropped: 9 taps give a standard
+# deviation of 2.58 pixels at the most, that of equal weights. More passes hold more.
 
 # %%
 asked = np.linspace(0, 6, 61)

@@ -297,7 +297,10 @@ def test_faults_are_named():
         ({"passes": 0}, r"`gaussian\(passes=...\)` must be a positive integer, got 0"),
         ({"sampling": "cubic"}, r"`gaussian\(sampling=...\)` must be one of .* got 'cubic'"),
         ({"sigma": -1.0}, r"`gaussian\(sigma=...\)` must be 0 or positive, got -1.0"),
-        ({"sigma": math.inf}, r"`gaussian\(sigma=...\)` must be finite without `taps`, got inf"),
+        (
+            {"sigma": math.inf},
+            r"`gaussian\(sigma=...\)` must be finite without .* got inf",
+        ),
         ({"sigma": 1.0, "row": 12}, r"`gaussian\(row=...\)` must be left out .* got 12"),
         ({"row": 9}, r"`gaussian\(row=...\)` must be 8, 10, 12 .* got 9"),
     ]:

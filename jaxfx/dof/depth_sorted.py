@@ -10,15 +10,12 @@ from jaxtyping import Array, Float
 
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._inputs import check_arguments, check_count, defocused
-from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, coverage, reach, row_half_width
-from jaxfx.dof._tiles import tiles
+from jaxfx.dof._spoiled import spoiled
+from jaxfx.dof._sprites import POINT_RADIUS, coverage, reach, row_half_width
+from jaxfx.dof._tiles import sum_all
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
-# Where "shift" adds fewer taps than this, it compiles sooner than "tiles", by half a second: as
-# much as forty calls take longer.
-_FEW_TAPS = 2**20
 # Coverage below this is none.
 _LEAST = 1e-12
 
@@ -91,22 +88,8 @@ def _depth_sorted(image, depth, lens, max_coc, slices):
         sums = _in_slices(value, radius, defocus / max_coc, far, slices)
     result = sums[..., :-1] / sums[..., -1:]
 
-    def spoiled():
-        reached = jnp.where(jnp.isnan(lens.defocus(depth)), max_coc / 2, radius)
-        return _sum_all(bad[..., None].astype(image.dtype), reached, far)[..., 0] > 0
-
-    spoils = jax.lax.cond(bad.any(), spoiled, lambda: bad)
+    spoils = spoiled(bad, depth.astype(image.dtype), lens, max_coc)
     return jnp.where(spoils[..., None], jnp.nan, result).astype(dtype)
-
-
-def _sum_all(
-    value: Float[Array, "height width value"], radius: Float[Array, "height width"], far: int
-) -> Float[Array, "height width value"]:
-    """The sums over all sprites, whatever hides them."""
-    zero, one = jnp.zeros_like(radius), jnp.ones((), radius.dtype)
-    sprites = Sprites(value, radius, zero - 1, zero, one)
-    is_small = radius.size * (2 * far + 1) ** 2 < _FEW_TAPS
-    return (shift if is_small else tiles)(sprites, far)
 
 
 def _in_slices(
@@ -125,7 +108,7 @@ def _in_slices(
         within = share > 0
         # A sprite of another slice is a point, so that it reaches no further than itself.
         part = jnp.where(within, share, 0)[..., None] * value
-        added = _sum_all(part, jnp.where(within, radius, POINT_RADIUS), far)
+        added = sum_all(part, jnp.where(within, radius, POINT_RADIUS), far)
         opacity = added[..., -1:]
         visible = clip01((1 - covered) / jnp.maximum(opacity, _LEAST))
         return (sums + visible * added, covered + opacity), None

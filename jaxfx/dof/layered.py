@@ -5,14 +5,14 @@ import functools as ft
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxfx._numerics import check, check_depth, check_image, clip01, parameter, sum_planes
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof._sheets import composited
-from jaxfx.dof._shift import shift
 from jaxfx.dof._slices import SLICES, Sheets
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
+from jaxfx.dof._spoiled import spoiled
+from jaxfx.dof._sprites import POINT_RADIUS, reach
 from jaxfx.lens import FocusPlanes, ThinLens
 
 
@@ -104,7 +104,7 @@ def _layered(image, depth, lens, max_coc, behind, threshold):
     view = defocused(image, depth, lens, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
     layers = [_sheet(view.image, view.defocus, jnp.ones_like(view.defocus), threshold)]
-    spoiled = _spoiled(view.bad, depth, view.defocus, max_coc)
+    spoils = spoiled(view.bad, depth.astype(view.image.dtype), lens, max_coc)
     if behind is not None:
         second = defocused(behind[0], behind[1], lens, max_coc)
         there = jnp.isfinite(behind[1]) & ~second.bad
@@ -114,14 +114,14 @@ def _layered(image, depth, lens, max_coc, behind, threshold):
         apart = clip01((farther - view.defocus) / threshold - 1)
         through = jnp.where(there, clip01(seen / _SEEN) * apart, 0)
         layers.append(_sheet(second.image, farther, through, threshold))
-        spoiled |= _spoiled(second.bad, behind[1], second.defocus, max_coc)
+        spoils |= spoiled(second.bad, behind[1].astype(view.image.dtype), lens, max_coc)
     far = reach(max_coc)
     # Beyond the frame all goes on as it ends there.
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
     sheets = jax.tree.map(lambda *x: jnp.stack([pad(each) for each in x]), *layers)
     light, late = jnp.split(jnp.moveaxis(composited(far, sheets), 0, -1), 2, axis=-1)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
-    return jnp.where(spoiled[..., None], jnp.nan, result).astype(image.dtype)
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)
 
 
 def _sheet(
@@ -199,21 +199,3 @@ def _seen(
         return 1 - clip01(hidden) ** 2
 
     return jnp.mean(jax.lax.map(visible, jnp.asarray(ways)), axis=0)
-
-
-def _spoiled(
-    bad: Bool[Array, "height width"],
-    depth: Float[Array, "height width"],
-    defocus: Float[Array, "height width"],
-    max_coc: float,
-) -> Bool[Array, "height width"]:
-    """Where the sprites of the `bad` pixels reach; nothing is computed if there are none."""
-    radius = jnp.where(depth > 0, jnp.maximum(jnp.abs(defocus) / 2, POINT_RADIUS), max_coc / 2)
-    radius = jax.lax.stop_gradient(radius)
-
-    def cover():
-        zero, one = jnp.zeros_like(radius), jnp.ones((), radius.dtype)
-        value = bad[..., None].astype(radius.dtype)
-        return shift(Sprites(value, radius, zero - 1, zero, one), reach(max_coc))[..., 0] > 0
-
-    return jax.lax.cond(bad.any(), cover, lambda: bad)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxfx._numerics import (
     check,
@@ -19,8 +19,8 @@ from jaxfx._numerics import (
     working_dtype,
 )
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
-from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
+from jaxfx.dof._spoiled import spoiled
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.dof._tiles import farthest, shifts, tiles
 from jaxfx.lens import FocusPlanes, ThinLens
@@ -162,11 +162,6 @@ def _largest(depth: Float[Array, "height width"], lens: ThinLens | FocusPlanes) 
         return float(jnp.nanmax(lens.circle_of_confusion(depth)))
 
 
-def _radius(coc: Float[Array, "height width"], max_coc: int | float) -> Array:
-    coc = jnp.where(coc < max_coc, coc, max_coc)
-    return jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
-
-
 def to_sprites(
     image: Float[Array, "height width channel"],
     depth: Float[Array, "height width"],
@@ -179,7 +174,7 @@ def to_sprites(
     dtype = image.dtype
     coc = lens.circle_of_confusion(depth)
     coc = jnp.where(coc < max_coc, coc, max_coc)
-    radius = _radius(coc, max_coc)
+    radius = jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
 
     focus = lens.focus_distance.astype(dtype)
     foreground = depth < focus
@@ -193,27 +188,6 @@ def to_sprites(
     value = jnp.concatenate([image, one], axis=-1) * weight[..., None]
     epsilon = jnp.maximum(epsilon.astype(dtype), _SMALLEST_EPSILON)
     return Sprites(value, radius, jnp.where(foreground, -1, coc), coc, epsilon)
-
-
-def _spoiled(
-    wrong: Bool[Array, "height width"],
-    radius: Float[Array, "height width"],
-    max_coc: int | float,
-) -> Bool[Array, "height width"]:
-    """Where the sprites of the `wrong` pixels reach; nothing is computed if there are none."""
-
-    def cover(wrong, radius):
-        value = wrong[..., None].astype(radius.dtype)
-        zero = jnp.zeros_like(radius)
-        one = jnp.ones((), radius.dtype)
-        return shift(Sprites(value, radius, zero - 1, zero, one), reach(max_coc))[..., 0] > 0
-
-    # One by one, since under `vmap` a `cond` of its own would compute both.
-    @sequential_vmap
-    def spoiled(wrong, radius):
-        return jax.lax.cond(wrong.any(), cover, lambda wrong, _: wrong, wrong, radius)
-
-    return spoiled(wrong, radius)
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(5, 6, 7))
@@ -290,14 +264,12 @@ def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     image = image.astype(working_dtype(dtype))
     depth = depth.astype(image.dtype)
 
-    coc = lens.circle_of_confusion(depth)
+    given, coc = depth, lens.circle_of_confusion(depth)
     lost = jnp.isnan(coc) | (depth < 0)
     wrong = lost | ~jnp.isfinite(image).all(axis=-1)
     image = jnp.where(wrong[..., None], 0, image)
     depth = jnp.where(lost, lens.focus_distance.astype(image.dtype), depth)
 
     result = _in_or_out_of_focus(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage)
-    radius = jax.lax.stop_gradient(_radius(coc, max_coc))
-    radius = jnp.where(lost, max_coc / 2, radius)
-    spoiled = _spoiled(wrong, radius, max_coc)
-    return jnp.where(spoiled[..., None], jnp.nan, result).astype(dtype)
+    spoils = spoiled(wrong, given, lens, max_coc)
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(dtype)
