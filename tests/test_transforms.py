@@ -152,7 +152,7 @@ EXAMPLES = {
     "bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "slope_bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "size": [lambda rng, size: 3],
-    "dilation": [lambda rng, size: 2],
+    "dilation": [lambda rng, size: None, lambda rng, size: 2],
     "light_size": [lambda rng, size: np.array(rng.uniform(0.2, 0.3))],
     "min_variance": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "camera": [pinhole, orthographic],
