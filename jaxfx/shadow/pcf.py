@@ -39,9 +39,9 @@ def hard(
       nothing.
     - `receivers`: what `receivers` returned, height width.
     - `bias`: scene units by which a texel must be nearer to shadow.
-    - `slope_bias`: texels of the map by which the same grows where light grazes: so many times
+    - `slope_bias`: pixels of the map by which the same grows where light grazes: so many times
       the change of depth from one to the next, the receivers' `slope`. Where both are left out,
-      they are what keeps a plane lit and no more: half a texel, here, and what rounding takes.
+      they are what keeps a plane lit and no more: here half a pixel, and what rounding takes.
       Where one is given, the other is 0.
 
     **Returns:** height width, 0 or 1, in the type of the receivers.
