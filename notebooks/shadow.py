@@ -33,9 +33,9 @@ from jaxfx import AmbientLight, DirectionalLight, PointLight, fit, io, relight, 
 
 
 # The scenes that the tests and benchmarks use, whichever folder this runs in.
-root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "tests/benchmarks").is_dir())
-sys.path.append(str(root / "tests/benchmarks"))
-import shadow_scenes
+root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks").is_dir())
+sys.path.append(str(root))
+from benchmarks.scenes import shadow as shadow_scenes
 
 
 set_matplotlib_formats("jpeg", pil_kwargs={"quality": 80})
@@ -114,12 +114,12 @@ assert int(exact.comparisons) == 2 * exact.where.size + int(exact.where.sum()) *
 # ## Time against the size of the filter
 #
 # $512^2$ receivers, float32, 3 to 5 % of them in a penumbra. The times were measured on two
-# idle cores by `tests/benchmarks/shadow_growth.py` and are read from its file: here, beside
+# idle cores by `benchmarks/shadow_growth.py` and are read from its file: here, beside
 # other work, they would be noise.
 
 # %%
 times = {}
-with open(root / "tests/benchmarks/shadow_growth.csv") as file:
+with open(root / "docs/shadow_growth.csv") as file:
     for row in csv.DictReader(file):
         times.setdefault(row["method"], {})[int(row["size"])] = float(row["milliseconds"])
 figure, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")

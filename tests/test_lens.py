@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import check_slopes
 
 from jaxfx import FocusPlanes, PinholeCamera, ThinLens
+from tests.helpers.quick import check_slopes
 
 
 LENS = ThinLens(0.1, 2.0, 100.0)

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit, quickly
 
 import jaxfx
 import jaxfx.shadow
+from tests.helpers.quick import quick_jit, quickly
 
 
 # Not functions of arrays: the host side reads files and meshes; solvers, measurements and plans

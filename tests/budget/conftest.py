@@ -5,9 +5,9 @@ import statistics
 
 import numpy as np
 import pytest
-from quick import quickly
 
 from jaxfx.budget import _plan
+from tests.helpers.quick import quickly
 
 
 @pytest.fixture(autouse=True, scope="package")

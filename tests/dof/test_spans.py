@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from quick import quick_jit
 
 from jaxfx import ThinLens, dof
 from jaxfx.dof._paint import BLOCK
@@ -18,6 +17,7 @@ from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import Sprites
 from jaxfx.dof._tiles import tiles
+from tests.helpers.quick import quick_jit
 
 
 REACH = 21

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from shadow_scenes import Boxes
 
+from benchmarks.scenes.shadow import Boxes
 from jaxfx import (
     AmbientLight,
     DirectionalLight,

@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from relight_views import FRONT, REFLECTANCES, one_pixel, sun
 
 from jaxfx import (
     AmbientLight,
@@ -20,6 +18,8 @@ from jaxfx import (
     SpotLight,
     relight,
 )
+from tests.cases.relight_views import FRONT, REFLECTANCES, one_pixel, sun
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import relight_scenes
-from quick import quick_jit
 
+from benchmarks.scenes import relight as relight_scenes
 from jaxfx import (
     AmbientLight,
     DirectionalLight,
@@ -20,6 +19,7 @@ from jaxfx import (
     relight,
     scene,
 )
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -201,7 +201,7 @@ def test_a_bad_pixel_stays_where_it_is():
 
 @pytest.mark.parametrize("count", [10, 100, 1000])
 def test_the_work_of_an_edit_does_not_depend_on_the_number_of_lights(count):
-    """Counted in what is compiled; `tests/benchmarks` has the times."""
+    """Counted in what is compiled; `benchmarks` has the times."""
 
     def work(count):
         lights = make_lights(1, kinds=(point,)) * count

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from relight_views import (
+
+from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
+from tests.cases.relight_views import (
     BLUE,
     CAMERAS,
     FRONTAL,
@@ -24,8 +25,7 @@ from relight_views import (
     plane,
     points,
 )
-
-from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")

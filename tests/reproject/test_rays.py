@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reproject_cases import camera
 
+from benchmarks.scenes.reproject import camera
 from jaxfx import OrthographicCamera
 from jaxfx.reproject._rays import view_rays
 

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from shadow_scenes import noise, plate, steps
 
+from benchmarks.scenes.shadow import noise, plate, steps
 from jaxfx import shadow
 from jaxfx.shadow.edge import usual_dilation
+from tests.helpers.quick import quick_jit
 
 from .conftest import naive_pcf
 

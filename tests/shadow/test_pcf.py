@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from shadow_scenes import noise
 
+from benchmarks.scenes.shadow import noise
 from jaxfx import shadow
+from tests.helpers.quick import quick_jit
 
 from .conftest import naive_pcf
 

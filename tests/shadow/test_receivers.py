@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx import OrthographicCamera, PinholeCamera, shadow
 from jaxfx._sampling import pixel_centers
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx import shadow
+from tests.helpers.quick import quick_jit
 
 
 def at(u, v, z):
