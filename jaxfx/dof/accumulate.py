@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
 
 from jaxfx._numerics import safe_sqrt
+from jaxfx._progress import counted
 from jaxfx.camera import PinholeCamera
 from jaxfx.lens import ThinLens
 
@@ -34,7 +34,7 @@ def accumulate(
     samples: int = 256,
     jitter: bool = True,
     seed: int = 0,
-    progress: bool = True,
+    progress: bool = False,
 ) -> Accumulation:
     """Depth of field by many passes: the mean of pictures from points all over the lens.
 
@@ -51,7 +51,7 @@ def accumulate(
     - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
       pixel.
     - `seed`: turns the sequence to another of its kind.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** an `Accumulation`: `image`, height width channel, and `convergence`.
 
@@ -73,7 +73,7 @@ def accumulate(
 
     offsets, shifts = lens_samples(samples, seed)
     total = half = None
-    for index in tqdm(range(samples), desc="lens", disable=not progress, leave=False):
+    for index in counted(range(samples), progress, "lens"):
         offset = lens.aperture * jnp.asarray(offsets[index], lens.aperture.dtype)
         eye = camera.through_lens(offset, focus_distance=lens.focus_distance)
         if jitter:

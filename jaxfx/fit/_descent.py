@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
+
+from jaxfx._progress import Bar
 
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -34,7 +35,7 @@ def descend(
     *,
     solver: Solver | None,
     max_steps: int,
-    bar: tqdm,
+    bar: Bar,
 ) -> End:
     """From a start to the end that a solver finds, Levenberg-Marquardt if none is given.
 
@@ -52,8 +53,7 @@ def descend(
         given = y
         y, state, loss, done, result = _step(solver, fn, y, state)
         losses.append(loss)
-        bar.update()
-        bar.set_postfix(mse=f"{float(loss):.3g}")
+        bar.step(mse=f"{float(loss):.3g}")
         waited = waited + 1 if loss > (1 - _GAIN) * lowest else 0
         if loss < lowest:
             lowest, best = float(loss), given

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from tqdm.auto import tqdm
 
 from jaxfx._numerics import check_image, safe_divide
+from jaxfx._progress import Bar
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
@@ -62,7 +62,7 @@ def camera(
     solver: Solver | None = None,
     max_steps: int = 32,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> CameraFit:
     """The pose from which a photograph was taken, given another one with its depth.
 
@@ -97,7 +97,7 @@ def camera(
       Levenberg-Marquardt.
     - `max_steps`: of the solver, for each blur.
     - `throw`: raise where the solver fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `CameraFit`.
 
@@ -113,7 +113,7 @@ def camera(
     reference, image, depth = _pictures(reference, image, depth)
     _check(source, start, max_steps)
     check_options("camera", reference.shape[:2], "pyramid", hole_threshold)
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         model, end = _search(reference, image, depth, source, start, hole_threshold, descend_on)
     columns, residual, share = _report(model, end.unknowns)

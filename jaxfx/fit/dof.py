@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
 
 from jaxfx._numerics import check, check_depth, check_image, parameter
+from jaxfx._progress import Bar
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import largest_coc, scatter
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
@@ -86,7 +86,7 @@ def dof(
     parameters: Collection[str] | None = None,
     max_steps: int = 64,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> DofFit:
     """The lens and the other parameters that make a method look most like a reference.
 
@@ -112,7 +112,7 @@ def dof(
       `fit.LAYERED_PARAMETERS`; the others stay as given. By default all of them.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the solver fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `DofFit`.
 
@@ -132,7 +132,7 @@ def dof(
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         solve = lambda model, y: descend(
             _Residual(model, reference), y, solver=solver, max_steps=max_steps, bar=bar
         )

@@ -10,9 +10,9 @@ import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
 
 from jaxfx._numerics import check_image, parameter
+from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
 from jaxfx.fit._lighting import (
@@ -79,7 +79,7 @@ def lights(
     parameters: Collection[str] = LIGHT_PARAMETERS,
     max_steps: int = 64,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> LightsFit:
     """The lights under which a deep frame buffer looks most like a reference.
 
@@ -108,7 +108,7 @@ def lights(
     - `parameters`: the names to fit, out of `fit.LIGHT_PARAMETERS`; the others stay as given.
     - `max_steps`: of the solver, in each round.
     - `throw`: raise where the last round fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `LightsFit`.
 
@@ -127,7 +127,7 @@ def lights(
     for name, value in (("rounds", rounds), ("max_steps", max_steps)):
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"`lights({name}=...)` must be a positive integer, got {value}.")
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         model, end = _search_in_rounds(
             rounds,
             start,
@@ -235,7 +235,7 @@ def _search(
     reference: Float[Array, "height width 3"],
     solver: Solver | None,
     max_steps: int,
-    bar: tqdm,
+    bar: Bar,
 ) -> End:
     """One round: an `End` whose unknowns are the lights found."""
     search = Search(model, lights, spread(model.gbuffer, model.camera))
