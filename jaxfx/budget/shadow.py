@@ -131,10 +131,8 @@ def shadow(
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    biases = tuple(
-        each if each is None else parameter(f"shadow({name}=...)", each)
-        for name, each in (("bias", bias), ("slope_bias", slope_bias))
-    )
+    given = lambda name, each: None if each is None else parameter(f"shadow({name}=...)", each)
+    biases = given("bias", bias), given("slope_bias", slope_bias)
     where = candidates(
         shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1], mask="depth"
     ).where

@@ -79,18 +79,24 @@ def shade(
 
 
 def render(
-    gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera, lights: Sequence[Light]
+    gbuffer: GBuffer,
+    camera: PinholeCamera | OrthographicCamera,
+    lights: Sequence[Light],
+    *,
+    visibilities: Sequence[Float[ArrayLike, "height width"] | None] | None = None,
 ) -> Float[Array, "height width 3"]:
-    """The picture under several lights: the sum of `shade` over them, without shadows.
+    """The image under several lights and their shadows: the sum of `shade` over them.
 
     **Arguments:**
 
     - `gbuffer`, `camera`: as in `shade`.
-    - `lights`: a sequence of lights of any kinds. None give a black picture.
+    - `lights`: a sequence of lights of any kinds. None give a black image.
+    - `visibilities`: for each light, height width in [0, 1], or None where it has no shadows.
+      None alone stands for no shadows at all.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`.
 
-    **Raises:** `ValueError` as `shade` does.
+    **Raises:** `ValueError` as `shade` does, and for `visibilities` that do not fit.
 
     **Gradient:** as `shade`'s. A reverse pass shades each light again, so that its memory does
     not grow with their number.
@@ -101,7 +107,9 @@ def render(
         kind = type(lights).__name__
         raise ValueError(f"`render(lights)` must be a sequence of lights, got {kind}.")
     named = {f"render(lights[{index}])": light for index, light in enumerate(lights)}
-    return _render(checked(gbuffer, named), camera, tuple(lights))
+    gbuffer = checked(gbuffer, named)
+    visibilities = checked_visibilities("render", visibilities, len(lights), gbuffer)
+    return _render(gbuffer, camera, tuple(lights), visibilities)
 
 
 class Surface(NamedTuple):
@@ -236,25 +244,61 @@ def checked(gbuffer: GBuffer, lights: dict[str, Any]) -> GBuffer:
     return gbuffer
 
 
+def checked_visibilities(
+    function: str, visibilities: Any, count: int, gbuffer: GBuffer
+) -> tuple[_Scalars | None, ...]:
+    """An image or None for each of `count` lights; `ValueError` names a wrong one."""
+    name = f"{function}(visibilities=...)"
+    entries = (None,) * count if visibilities is None else tuple(visibilities)
+    if len(entries) != count:
+        raise ValueError(
+            f"`{name}` must hold an image or None for each of {count} lights, "
+            f"got {len(entries)}."
+        )
+    shape = gbuffer.depth.shape
+    return tuple(each if each is None else parameter(name, each, shape) for each in entries)
+
+
+def stacked(
+    visibilities: Sequence[_Scalars | None], surface: Surface
+) -> Float[Array, "light height width"] | None:
+    """Those of some lights, all 1 where one has no shadows; None where none has any."""
+    if all(visible is None for visible in visibilities):
+        return None
+    dtype, lit = surface.position.dtype, jnp.ones_like(surface.exponent)
+    return jnp.stack([lit if each is None else each.astype(dtype) for each in visibilities])
+
+
+def seen(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> _Vectors:
+    """What a light brings, where it is visible; a hole's visibility is not read."""
+    if visibility is None:
+        return image
+    visibility = jnp.where(surface.shader == _NOTHING, 0, visibility.astype(image.dtype))
+    return visibility[..., None] * image
+
+
 @jax.jit
 def _shade(gbuffer, camera, light, visibility):
     surface = to_surface(gbuffer, camera)
-    image = reflected(surface, light)
-    if visibility is not None:
-        visibility = jnp.where(surface.shader == _NOTHING, 0, visibility.astype(image.dtype))
-        image = image * visibility[..., None]
+    image = seen(surface, reflected(surface, light), visibility)
     return image.astype(gbuffer.color.dtype)
 
 
 @jax.jit
-def _render(gbuffer, camera, lights):
+def _render(gbuffer, camera, lights, visibilities):
     surface = to_surface(gbuffer, camera)
     image = jnp.zeros_like(surface.position)
     again = jax.checkpoint(reflected, prevent_cse=False)
-    add = lambda image, light: (image + again(surface, light), None)
     stack = lambda *leaves: jnp.stack([leaf.astype(image.dtype) for leaf in leaves])
+
+    def add(image, term):
+        light, visibility = term
+        return image + seen(surface, again(surface, light), visibility), None
+
     for kind in get_args(Light):
-        group = [light for light in lights if isinstance(light, kind)]
-        if group:
-            image, _ = jax.lax.scan(add, image, jax.tree.map(stack, *group))
+        which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
+        if which:
+            group = jax.tree.map(stack, *(lights[i] for i in which))
+            shadows = stacked([visibilities[i] for i in which], surface)
+            image, _ = jax.lax.scan(add, image, (group, shadows))
     return image.astype(gbuffer.color.dtype)
