@@ -58,9 +58,9 @@ def depth_sorted(
     **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
     a bad `slices`, or no `max_coc` under a transform.
 
-    **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; zero where a
-    circle is clamped. With `slices="all"` that of the order itself is missing: where two
-    surfaces change places, the result jumps.
+    **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; in the last
+    two, zero where a circle is below a pixel or above `max_coc`. With `slices="all"` that of
+    the order itself is missing: where two surfaces change places, the result jumps.
 
     Source: Potmesil & Chakravarty 1981, partial visibility of a sprite; Demers 2004, blending
     in order of depth. Reconstructed: the order is kept front to back, since "over" of single

@@ -21,6 +21,22 @@ Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 _PATIENCE, _GAIN = 6, 1e-5
 
 
+_Item: Any = type(optx.RESULTS.successful)
+
+
+class Verdict(_Item):
+    """One of `optimistix.RESULTS`, equal to it, that prints as a sentence, a success too."""
+
+    def __repr__(self) -> str:
+        return optx.RESULTS[self] or "The search converged."
+
+
+def verdict(result: optx.RESULTS) -> Any:
+    """A `Verdict` of optimistix' own."""
+    (index,) = jax.tree.leaves(result)
+    return Verdict(index, optx.RESULTS)
+
+
 class End(NamedTuple):
     """Where a solver stopped, the losses at its start and after every step, its verdict."""
 
@@ -48,7 +64,7 @@ def descend(
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     y, state = unknowns, _begin(solver, fn, unknowns)
     losses, lowest, best, waited = [], math.inf, y, 0
-    verdict = optx.RESULTS.nonlinear_max_steps_reached
+    reason = optx.RESULTS.nonlinear_max_steps_reached
     for _ in range(max_steps):
         given = y
         y, state, loss, done, result = _step(solver, fn, y, state)
@@ -58,13 +74,13 @@ def descend(
         if loss < lowest:
             lowest, best = float(loss), given
         if done or waited >= patience or result != optx.RESULTS.successful:
-            verdict = result
+            reason = result
             break
-    y = _finish(solver, fn, y, state, losses[-1], verdict)
+    y = _finish(solver, fn, y, state, losses[-1], reason)
     loss = _loss(fn, y)
     if not math.isfinite(loss):
-        y, loss, verdict = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
-    return End(y, [*losses, loss], verdict)
+        y, loss, reason = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
+    return End(y, [*losses, loss], verdict(reason))
 
 
 class _Objective(eqx.Module):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxfx._numerics import check, check_depth, check_image, parameter
 from jaxfx._progress import Bar
+from jaxfx.dof._sprites import POINT_RADIUS
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import largest_coc, scatter
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
@@ -50,7 +51,7 @@ class DofFit(eqx.Module):
       minima.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
       larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
-    - `result`: optimistix' verdict.
+    - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
     """
 
     lens: ThinLens
@@ -117,8 +118,9 @@ def dof(
     **Returns:** a `DofFit`.
 
     **Raises:** `ValueError` for what the method refuses, for shapes that differ, an unknown
-    or empty choice of parameters, a zero aperture to start from, or a picture that is not
-    finite. `RuntimeError` where the solver fails and `throw` is true.
+    or empty choice of parameters, a lens to start from that no derivative moves (a zero
+    aperture, or circles of confusion that all are below a pixel or above `max_coc`), or a
+    picture that is not finite. `RuntimeError` where the solver fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
     """
@@ -131,6 +133,8 @@ def dof(
     unknowns = {name: _unconstrain(name, start[name]) for name in _names(method, parameters)}
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
+    if {"aperture", "focus_distance"} & set(unknowns):
+        _check_that_it_moves(lens, depth, behind, max_coc)
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
     with Bar(progress, "fit") as bar:
         solve = lambda model, y: descend(
@@ -140,7 +144,7 @@ def dof(
     if throw and end.result != optx.RESULTS.successful:
         raise RuntimeError(
             f"`dof` found no fit in {len(end.losses)} steps, the mean squared residual going "
-            f"from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {optx.RESULTS[end.result]} "
+            f"from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {end.result} "
             "`throw=False` returns what was reached."
         )
 
@@ -192,6 +196,23 @@ def _start(lens: Any, gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
     for name in ("gamma", "epsilon", "threshold"):
         check(f"dof({name}=...)", start[name], lambda v: v >= 0, "0 or positive")
     return {name: value.astype(dtype) for name, value in start.items()}
+
+
+def _check_that_it_moves(lens: ThinLens, depth: Array, behind: Any, max_coc: Any) -> None:
+    """`ValueError` for a lens of which no pixel's circle of confusion has a derivative."""
+    depths = (depth,) if behind is None else (depth, jnp.asarray(behind[1]))
+    circles = jnp.stack([lens.circle_of_confusion(each) for each in depths])
+    most = math.inf if max_coc is None else max_coc
+    # What is no diameter at all is named by the method.
+    if most <= 0 or bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
+        return
+    least, largest = (float(each(circles)) for each in (jnp.nanmin, jnp.nanmax))
+    raise ValueError(
+        "`dof(lens)` must start with a circle of confusion between a pixel and `max_coc` "
+        "somewhere, for no other has a derivative that could move the aperture or the focus "
+        f"distance, got circles from {least:.3g} to {largest:.3g} pixels and "
+        f"`max_coc` {max_coc}."
+    )
 
 
 def _names(method: Method, parameters: Collection[str] | None) -> list[str]:
