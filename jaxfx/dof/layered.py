@@ -77,11 +77,11 @@ def layered(
     a negative `threshold`, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
-    every field of `lens`, forward and reverse. In the lens and the depth, zero where a circle
-    of confusion is below a pixel, which its sprite then fills whatever its size, or above
-    `max_coc`: from a lens all of whose circles are, no search moves. There is no kink where
-    neighbours have one depth or a surface is in focus. At the others, the ends of a clamp and a
-    lens that is just filled, each sprite and pixel has the value of one side.
+    every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
+    where a circle of confusion is below a pixel or above `max_coc`: no search leaves a lens all
+    of whose circles are. There is no kink where neighbours have one depth or a surface is in
+    focus. At the others, the ends of a clamp and a lens that is just filled, each sprite and
+    pixel has the value of one side.
 
     Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
     pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.

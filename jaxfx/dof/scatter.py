@@ -90,11 +90,10 @@ def scatter(
 
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
     `lens`, silhouettes included, forward and reverse; again by `jax.jacfwd(jax.grad(loss))`,
-    which `jax.hessian` is. In the lens and the depth, zero where a circle of confusion is below
-    a pixel, which its sprite then fills whatever its size, or above `max_coc`: from a lens all
-    of whose circles are, no search moves. At a kink (the focus plane, the ends of both clamps)
-    one of the two one-sided values. With `coverage="indicator"` the derivative of the coverage,
-    almost everywhere zero, is missing.
+    which `jax.hessian` is. In `lens` and `depth`, zero where a circle of confusion is below a
+    pixel or above `max_coc`: no search leaves a lens all of whose circles are. At a kink (the
+    focus plane, the ends of both clamps) one of the two one-sided values. With
+    `coverage="indicator"` that of the coverage, almost everywhere zero, is missing.
 
     Source: Lee, Kim & Choi, real-time depth of field rendering using pixel intensity scatter on
     GPU, sections 3 and 4; the model is that of Potmesil & Chakravarty 1981. Our own: the exact

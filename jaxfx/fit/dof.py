@@ -118,9 +118,9 @@ def dof(
     **Returns:** a `DofFit`.
 
     **Raises:** `ValueError` for what the method refuses, for shapes that differ, an unknown
-    or empty choice of parameters, a lens to start from that no derivative moves (a zero
-    aperture, or circles of confusion that all are below a pixel or above `max_coc`), or a
-    picture that is not finite. `RuntimeError` where the solver fails and `throw` is true.
+    or empty choice of parameters, a lens to start from that can't move (a zero aperture; all
+    circles of confusion below a pixel or above `max_coc`), or a picture that is not finite.
+    `RuntimeError` where the solver fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
     """
@@ -133,8 +133,7 @@ def dof(
     unknowns = {name: _unconstrain(name, start[name]) for name in _names(method, parameters)}
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
-    if {"aperture", "focus_distance"} & set(unknowns):
-        _check_that_it_moves(lens, depth, behind, max_coc)
+    _check_moves(unknowns, lens, depth, behind, max_coc)
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
     with Bar(progress, "fit") as bar:
         solve = lambda model, y: descend(
@@ -198,8 +197,12 @@ def _start(lens: Any, gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
     return {name: value.astype(dtype) for name, value in start.items()}
 
 
-def _check_that_it_moves(lens: ThinLens, depth: Array, behind: Any, max_coc: Any) -> None:
-    """`ValueError` for a lens of which no pixel's circle of confusion has a derivative."""
+def _check_moves(
+    names: Collection[str], lens: ThinLens, depth: Array, behind: Any, max_coc: Any
+) -> None:
+    """`ValueError` for a lens to be found of which no circle of confusion has a derivative."""
+    if not {"aperture", "focus_distance"}.intersection(names):
+        return
     depths = (depth,) if behind is None else (depth, jnp.asarray(behind[1]))
     circles = jnp.stack([lens.circle_of_confusion(each) for each in depths])
     most = math.inf if max_coc is None else max_coc

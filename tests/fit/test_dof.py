@@ -114,7 +114,7 @@ def test_a_lens_that_no_derivative_moves_may_be_held():
     how = {"parameters": ("gamma",), "max_coc": 2.0, "throw": False}
     held = fit.dof(0.9 * image, image, depth, lens, **how)
     assert held.lens.aperture == lens.aperture
-    assert np.isinf(held.uncertainty["gamma"])
+    assert held.uncertainty["gamma"] > 1e6
 
 
 def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
