@@ -32,7 +32,7 @@ from jaxfx import (
     scene,
     shadow,
 )
-from jaxfx.dof.scatter import largest_coc
+from jaxfx.dof._inputs import largest_coc
 
 
 SIZE, ERROR = (384, 512), 1e-2

@@ -11,19 +11,22 @@ The types live here. The effects are the modules `blur`, `dof`, `reproject`, `sh
 import importlib
 from typing import Any
 
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer, Transfer
-from jaxfx.lens import FocusPlanes, ThinLens
-from jaxfx.light import AmbientLight, DirectionalLight, PointLight, SpotLight
+from jaxfx.lens import FocusPlanes, Lens, ThinLens
+from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
 
 
 __version__ = "0.1.0.dev0"
 
 __all__ = [
     "AmbientLight",
+    "Camera",
     "DirectionalLight",
     "FocusPlanes",
     "GBuffer",
+    "Lens",
+    "Light",
     "OrthographicCamera",
     "PinholeCamera",
     "PointLight",

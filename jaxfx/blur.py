@@ -12,6 +12,16 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfx._checks import (
+    WholeNumber,
+    as_array,
+    check,
+    check_image,
+    is_concrete,
+    option,
+    parameter,
+    whole_number,
+)
 from jaxfx._filter import (
     Sampling,
     added,
@@ -21,7 +31,7 @@ from jaxfx._filter import (
     linear_reads,
     separable,
 )
-from jaxfx._numerics import check, check_image, is_concrete, parameter, working_dtype
+from jaxfx._numerics import working_dtype
 
 
 __all__ = ["binomial_weights", "downsample", "gaussian", "linear_taps"]
@@ -35,11 +45,11 @@ _TAPS, _DEVIATIONS = 9, 4
 def gaussian(
     image: Float[ArrayLike, "height width channel"],
     *,
-    taps: int | None = None,
-    passes: int = 1,
+    taps: WholeNumber | None = None,
+    passes: WholeNumber = 1,
     sampling: Sampling = "discrete",
     sigma: Float[ArrayLike, ""] | float | None = None,
-    row: int | None = None,
+    row: WholeNumber | None = None,
 ) -> Float[Array, "height width channel"]:
     """Gaussian blur: `taps` along the columns, then along the rows, `passes` times over.
 
@@ -81,17 +91,12 @@ def gaussian(
     linear sampling after Rakos 2010, efficient Gaussian blur with linear sampling.
     """
     image = check_image("gaussian(image)", image)
-    if taps is not None and (not isinstance(taps, int) or taps < 1 or taps % 2 == 0):
-        raise ValueError(
-            f"`gaussian(taps=...)` must be an odd positive integer, got {taps}. An even kernel "
-            "lies between pixels: `downsample` has it."
-        )
-    if not isinstance(passes, int) or passes < 1:
-        raise ValueError(f"`gaussian(passes=...)` must be a positive integer, got {passes}.")
-    if sampling not in get_args(Sampling):
-        raise ValueError(
-            f"`gaussian(sampling=...)` must be one of {get_args(Sampling)}, got {sampling!r}."
-        )
+    if taps is not None:
+        # An even kernel lies between pixels: `downsample` has it.
+        is_odd = lambda n: n >= 1 and n % 2 == 1
+        taps = whole_number("gaussian(taps=...)", taps, is_odd, "an odd positive integer")
+    passes = whole_number("gaussian(passes=...)", passes)
+    option("gaussian(sampling=...)", sampling, get_args(Sampling))
     if sigma is None:
         taps = _TAPS if taps is None else taps
         weights = _binomial("gaussian", taps, taps + 3 if row is None else row)
@@ -120,7 +125,7 @@ def _taps_of(sigma: Any, passes: int) -> int:
     return 2 * math.ceil(reach) + 1
 
 
-def binomial_weights(taps: int, *, row: int) -> Float[Array, "taps"]:
+def binomial_weights(taps: WholeNumber, *, row: WholeNumber) -> Float[Array, "taps"]:
     """The middle of a row of Pascal's triangle, divided by its own sum.
 
     Divided by the whole row's sum, 2 to the power of `row`, instead, what is dropped would
@@ -169,7 +174,7 @@ def linear_taps(
 
     Source: Rakos 2010, efficient Gaussian blur with linear sampling; the halved middle is ours.
     """
-    array = jnp.asarray(weights)
+    array = as_array("linear_taps(weights)", weights)
     if array.ndim != 1 or not array.size or not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(
             "`linear_taps(weights)` must be a vector of floats, "
@@ -183,7 +188,7 @@ def linear_taps(
 
 
 def downsample(
-    image: Float[ArrayLike, "height width channel"], *, taps: int = 2
+    image: Float[ArrayLike, "height width channel"], *, taps: WholeNumber = 2
 ) -> Float[Array, "half_height half_width channel"]:
     """The image at half its height and width, filtered by an even binomial kernel.
 
@@ -208,22 +213,22 @@ def downsample(
     Burt 1981 has them as generating kernels of pyramids.
     """
     image = check_image("downsample(image)", image)
-    if not isinstance(taps, int) or taps < 2 or taps % 2:
-        raise ValueError(f"`downsample(taps=...)` must be even and positive, got {taps}.")
+    is_even = lambda n: n >= 2 and n % 2 == 0
+    taps = whole_number("downsample(taps=...)", taps, is_even, "even and positive")
     weights = jnp.asarray(_binomial("downsample", taps, taps - 1))
     return _downsample(image, weights)
 
 
-def _binomial(function: str, taps: int, row: int) -> Float[np.ndarray, "taps"]:
+def _binomial(function: str, taps: Any, row: Any) -> Float[np.ndarray, "taps"]:
     """The middle `taps` of a row of Pascal's triangle, of sum 1."""
-    if not isinstance(taps, int) or taps < 1:
-        raise ValueError(f"`{function}(taps=...)` must be a positive integer, got {taps}.")
-    dropped = row + 1 - taps if isinstance(row, int) else -1
-    if dropped < 0 or dropped % 2:
-        raise ValueError(
-            f"`{function}(row=...)` must be {taps - 1}, {taps + 1}, {taps + 3} ..., so that "
-            f"{taps} taps lie in its middle, got {row}."
-        )
+    taps = whole_number(f"{function}(taps=...)", taps)
+    row = whole_number(
+        f"{function}(row=...)",
+        row,
+        lambda row: row + 1 >= taps and (row + 1 - taps) % 2 == 0,
+        f"{taps - 1}, {taps + 1}, {taps + 3} ..., so that {taps} taps lie in its middle",
+    )
+    dropped = row + 1 - taps
     kept = [math.comb(row, i) for i in range(dropped // 2, dropped // 2 + taps)]
     return np.array([weight / sum(kept) for weight in kept])
 

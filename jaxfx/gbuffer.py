@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import parameter
+from jaxfx._checks import as_array, parameter, share
 
 
 __all__ = ["GBuffer", "Transfer"]
@@ -28,7 +28,8 @@ class GBuffer(eqx.Module):
     - `depth`: height width, scene units along the optical axis, inf where there is nothing.
     - `roughness`: height width, in [0, 1].
 
-    **Raises:** `ValueError` where a shape does not fit `color`, or `shader` is not of integers.
+    **Raises:** `ValueError` where a shape does not fit `color`, `shader` is not of integers, or
+    a roughness lies outside [0, 1]; traced, one above 1 counts as 1.
 
     **Gradient:** exact with respect to every float image; `shader` has none.
 
@@ -55,13 +56,13 @@ class GBuffer(eqx.Module):
         depth: Any,
         roughness: Any,
     ):
-        shape = jnp.shape(color)
+        self.color = parameter("GBuffer(color)", color, None)
+        shape = self.color.shape
         if len(shape) != 3 or shape[2] != 3:
             raise ValueError(
                 f"`GBuffer(color)` must have shape (height, width, 3), got {shape}."
             )
-        self.color = parameter("GBuffer(color)", color, shape)
-        self.shader = jnp.asarray(shader)
+        self.shader = as_array("GBuffer(shader)", shader)
         if self.shader.shape != shape[:2] or not jnp.issubdtype(self.shader.dtype, jnp.integer):
             raise ValueError(
                 f"`GBuffer(shader)` must hold integers of shape {shape[:2]}, "
@@ -72,7 +73,7 @@ class GBuffer(eqx.Module):
         self.specular = parameter("GBuffer(specular)", specular, shape)
         self.normal = parameter("GBuffer(normal)", normal, shape)
         self.depth = parameter("GBuffer(depth)", depth, shape[:2])
-        self.roughness = parameter("GBuffer(roughness)", roughness, shape[:2])
+        self.roughness = share("GBuffer(roughness)", roughness, shape[:2])
 
 
 @final
@@ -104,16 +105,16 @@ class Transfer(eqx.Module):
     diffuse: Float[Array, "point 3"]
 
     def __init__(self, receive: Any, send: Any, position: Any, normal: Any, diffuse: Any):
-        shape = jnp.shape(send)
+        self.receive = parameter("Transfer(receive)", receive, None)
+        self.send = parameter("Transfer(send)", send, None)
+        shape = self.send.shape
         if len(shape) != 2:
             raise ValueError(f"`Transfer(send)` must have shape (rank, point), got {shape}.")
-        if len(jnp.shape(receive)) != 3 or jnp.shape(receive)[2] != shape[0]:
+        if self.receive.ndim != 3 or self.receive.shape[2] != shape[0]:
             raise ValueError(
                 f"`Transfer(receive)` must have shape (height, width, {shape[0]}), "
-                f"got {jnp.shape(receive)}."
+                f"got {self.receive.shape}."
             )
-        self.receive = parameter("Transfer(receive)", receive, jnp.shape(receive))
-        self.send = parameter("Transfer(send)", send, shape)
         self.position = parameter("Transfer(position)", position, (shape[1], 3))
         self.normal = parameter("Transfer(normal)", normal, (shape[1], 3))
         self.diffuse = parameter("Transfer(diffuse)", diffuse, (shape[1], 3))

@@ -1,20 +1,95 @@
 """Lenses: from depth to the diameter of the circle of confusion, in pixels."""
 
-from typing import Any, final
+from collections.abc import Sequence
+from typing import Any, ClassVar, Protocol, final, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import absolute, check, clip01, parameter
+from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
+from jaxfx._numerics import absolute, clip01, working_dtype
 from jaxfx.camera import PinholeCamera
 
 
-__all__ = ["FocusPlanes", "ThinLens"]
+__all__ = ["FocusPlanes", "Lens", "ThinLens"]
+
+# Depths as people have them: arrays, numbers and lists, of floats or integers.
+_Depths = Num[ArrayLike, "*shape"] | Sequence[Any]
+
+
+@runtime_checkable
+class Lens(Protocol):
+    """What every method of depth of field takes for a lens: three members, ours or your own.
+
+    A lens of your own that is a pytree, an `equinox.Module` say, is differentiated, batched and
+    compiled as ours are. Any other object is asked once a call, outside the compiled program.
+
+        class Clipped(eqx.Module):
+            lens: jaxfx.ThinLens
+            largest: float
+
+            @property
+            def focus_distance(self):
+                return self.lens.focus_distance
+
+            def defocus(self, depth):
+                return jnp.clip(self.lens.defocus(depth), -self.largest, self.largest)
+
+            def circle_of_confusion(self, depth):
+                return abs(self.defocus(depth))
+    """
+
+    @property
+    def focus_distance(self) -> Any:
+        """Depth of the plane in focus: a scalar, in scene units."""
+        ...
+
+    def defocus(self, depth: Any, /) -> Any:
+        """Signed diameter of the circle of confusion.
+
+        **Arguments:** `depth`: any shape, scene units; inf is background.
+
+        **Returns:** pixels, of the depth's shape: negative in front of the focus plane.
+
+        **Gradient:** the lens' own.
+        """
+        ...
+
+    def circle_of_confusion(self, depth: Any, /) -> Any:
+        """Diameter of the circle of confusion: `|defocus(depth)|`.
+
+        **Arguments:** `depth`: any shape, scene units; inf is background.
+
+        **Returns:** pixels, of the depth's shape.
+
+        **Gradient:** the lens' own.
+        """
+        ...
 
 
 def _all_positive(*values: Array) -> Array:
     return jnp.stack([value > 0 for value in values]).all()
+
+
+_positive = lambda v: v > 0
+_not_negative = lambda v: v >= 0
+
+
+def _finite(name: str, value: Any, valid: Any, expected: str) -> Float[Array, ""]:
+    number = parameter(name, value)
+    check(name, number, lambda v: valid(v) & (v < np.inf), expected)
+    return number
+
+
+def _measured(lens: Any, method: str, depth: Any, measure: Any) -> Array:
+    """A lens' factor times a measure of the depth's, in the type of the depth."""
+    check_fields(f"{type(lens).__name__}.{method}", lens)
+    depth = parameter(f"{method}(depth)", depth, None)
+    scale, factor = lens._factors(depth.astype(working_dtype(depth.dtype)))
+    return (scale * measure(factor)).astype(depth.dtype)
 
 
 @final
@@ -29,7 +104,7 @@ class ThinLens(eqx.Module):
     **Arguments:**
 
     - `aperture`: diameter of the lens, in scene units; 0 is a pinhole.
-    - `focus_distance`: depth of the plane in focus, in scene units.
+    - `focus_distance`: depth of the plane in focus, in scene units; inf is focus at infinity.
     - `focal_pixels`: the camera's focal length in pixels.
 
     **Raises:** `ValueError` for a negative aperture, or a focus distance or focal length that
@@ -40,17 +115,20 @@ class ThinLens(eqx.Module):
     Source: Potmesil & Chakravarty 1981, the circle of confusion of a thin lens.
     """
 
+    SHAPES: ClassVar = {"aperture": (), "focus_distance": (), "focal_pixels": ()}
+
     aperture: Float[Array, ""]
     focus_distance: Float[Array, ""]
     focal_pixels: Float[Array, ""]
 
     def __init__(self, aperture: Any, focus_distance: Any, focal_pixels: Any):
-        self.aperture = parameter("ThinLens(aperture)", aperture)
-        self.focus_distance = parameter("ThinLens(focus_distance)", focus_distance)
-        self.focal_pixels = parameter("ThinLens(focal_pixels)", focal_pixels)
-        check("ThinLens(aperture)", self.aperture, lambda v: v >= 0, "0 or positive")
-        check("ThinLens(focus_distance)", self.focus_distance, lambda v: v > 0, "positive")
-        check("ThinLens(focal_pixels)", self.focal_pixels, lambda v: v > 0, "positive")
+        name = "ThinLens(focus_distance)"
+        self.aperture = _finite("ThinLens(aperture)", aperture, _not_negative, "0 or positive")
+        self.focus_distance = parameter(name, focus_distance)
+        check(name, self.focus_distance, _positive, "positive")
+        self.focal_pixels = _finite(
+            "ThinLens(focal_pixels)", focal_pixels, _positive, "positive"
+        )
 
     @classmethod
     def from_camera(
@@ -66,8 +144,14 @@ class ThinLens(eqx.Module):
 
         **Returns:** the lens.
 
+        **Raises:** `ValueError` for a camera that is no pinhole, or as `ThinLens`.
+
         **Gradient:** exact, in the camera's focal length too.
         """
+        if not isinstance(camera, PinholeCamera):
+            kind = type(camera).__name__
+            raise ValueError(f"`from_camera(camera)` must be a PinholeCamera, got {kind}.")
+        check_fields("from_camera(camera)", camera)
         intrinsics = camera.intrinsics
         return cls(aperture, focus_distance, jnp.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))
 
@@ -106,10 +190,12 @@ class ThinLens(eqx.Module):
                 "`from_physical(aperture=..., f_number=...)` must be given one of the two, "
                 f"got {'neither' if aperture is None else 'both'}."
             )
-        focal_length = parameter("from_physical(focal_length=...)", focal_length)
+        name = "from_physical(focal_length=...)"
+        focal_length = _finite(name, focal_length, _positive, "positive")
         name = "from_physical(focus_distance=...)"
         distance = parameter(name, focus_distance)
-        scale = parameter("from_physical(pixels_per_unit=...)", pixels_per_unit)
+        name_of_scale = "from_physical(pixels_per_unit=...)"
+        scale = _finite(name_of_scale, pixels_per_unit, _positive, "positive")
         margin = distance - focal_length
         check(
             name,
@@ -118,8 +204,55 @@ class ThinLens(eqx.Module):
             "beyond `focal_length` (focus_distance - focal_length > 0)",
         )
         if aperture is None:
-            aperture = focal_length / parameter("from_physical(f_number=...)", f_number)
-        return cls(aperture, distance, focal_length * distance / margin * scale)
+            name = "from_physical(f_number=...)"
+            aperture = focal_length / _finite(name, f_number, _positive, "positive")
+        # A quotient that focus at infinity has as well.
+        image_distance = focal_length / (1 - focal_length / distance)
+        return cls(aperture, distance, image_distance * scale)
+
+    @classmethod
+    def from_sensor(
+        cls,
+        focal_length: Any,
+        f_stop: Any,
+        focus_distance: Any,
+        sensor_width: Any,
+        width: WholeNumber,
+    ) -> "ThinLens":
+        """A lens that stays where it is when it focuses, as Blender's does.
+
+        A real lens moves away from the sensor to focus nearer, and so shows less of the scene,
+        larger: `from_physical`, by a factor of `focus_distance / (focus_distance -
+        focal_length)`, 2 % at 2.6 m for 50 mm. Blender's sensor stays at the focal length.
+
+        **Arguments:**
+
+        - `focal_length`, `focus_distance`, `sensor_width`: lengths, all in one unit. Blender's
+          are in millimetres, but for the distance.
+        - `f_stop`: the ratio of the focal length to the aperture.
+        - `width`: static; pixels along the side that `sensor_width` fits: of Blender's "AUTO",
+          the longer one.
+
+        **Returns:** the lens: `focal_pixels` is `focal_length / sensor_width * width`, and
+        `aperture` is `focal_length / f_stop`.
+
+        **Raises:** `ValueError` for a number that is not positive.
+
+        **Gradient:** exact.
+
+        Source: Blender's Cycles, whose lens is `focal_length / (2 f_stop)` in radius and whose
+        rays through a pixel meet in the plane in focus.
+        """
+        focal_length, f_stop, sensor_width = (
+            _finite(f"from_sensor({name})", value, _positive, "positive")
+            for name, value in (
+                ("focal_length", focal_length),
+                ("f_stop", f_stop),
+                ("sensor_width", sensor_width),
+            )
+        )
+        width = whole_number("from_sensor(width)", width)
+        return cls(focal_length / f_stop, focus_distance, focal_length / sensor_width * width)
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
         """The lens' factor of the defocus, never negative, and the depth's, with the sign."""
@@ -133,30 +266,33 @@ class ThinLens(eqx.Module):
         inverse = 1 / jnp.where((scale == 0) & (depth == 0), 1, depth)
         return scale, 1 / distance - inverse
 
-    def defocus(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def defocus(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Signed diameter of the circle of confusion.
 
-        **Arguments:** `depth`: any shape, scene units; inf is allowed.
+        **Arguments:** `depth`: any shape, scene units, floats or integers; inf is allowed.
 
-        **Returns:** pixels, in the type of `depth`: negative in front of the focus plane,
-        0 on it, `aperture * focal_pixels / focus_distance` at infinity, -inf at depth 0.
+        **Returns:** pixels, in the type of `depth`, of integers in JAX's default float type:
+        negative in front of the focus plane, 0 on it, `aperture * focal_pixels /
+        focus_distance` at infinity, -inf at depth 0.
+
+        **Raises:** `ValueError` for what is no array of numbers, or a batch of lenses.
 
         **Gradient:** exact; not finite at depth 0.
         """
-        scale, difference = self._factors(jnp.asarray(depth))
-        return scale * difference
+        return _measured(self, "defocus", depth, lambda factor: factor)
 
-    def circle_of_confusion(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def circle_of_confusion(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Diameter of the circle of confusion: `|defocus(depth)|`.
 
-        **Arguments:** `depth`: any shape, scene units; inf is allowed.
+        **Arguments:** `depth`: any shape, scene units, floats or integers; inf is allowed.
 
-        **Returns:** pixels, in the type of `depth`.
+        **Returns:** pixels, in the type of `depth`, of integers in JAX's default float type.
+
+        **Raises:** `ValueError` as `defocus`.
 
         **Gradient:** exact; on the focus plane, a kink, the one from behind it.
         """
-        scale, difference = self._factors(jnp.asarray(depth))
-        return scale * absolute(difference)
+        return _measured(self, "circle_of_confusion", depth, absolute)
 
 
 @final
@@ -168,7 +304,8 @@ class FocusPlanes(eqx.Module):
 
     **Arguments:**
 
-    - `near`, `focus`, `far`: depths in scene units, `near < focus < far`.
+    - `near`, `focus`, `far`: depths in scene units, `near < focus < far`. A `far` of inf is
+      never reached: all behind `focus` is sharp.
     - `max_coc`: the largest diameter, in pixels.
 
     **Raises:** `ValueError` where the planes are out of order or `max_coc` is negative. Traced
@@ -179,6 +316,8 @@ class FocusPlanes(eqx.Module):
     Source: Scheuermann 2004, advanced depth of field.
     """
 
+    SHAPES: ClassVar = {"near": (), "focus": (), "far": (), "max_coc": ()}
+
     near: Float[Array, ""]
     focus: Float[Array, ""]
     far: Float[Array, ""]
@@ -188,11 +327,11 @@ class FocusPlanes(eqx.Module):
         self.near = parameter("FocusPlanes(near)", near)
         self.focus = parameter("FocusPlanes(focus)", focus)
         self.far = parameter("FocusPlanes(far)", far)
-        self.max_coc = parameter("FocusPlanes(max_coc)", max_coc)
+        self.max_coc = _finite("FocusPlanes(max_coc)", max_coc, _not_negative, "0 or positive")
+        check("FocusPlanes(near)", self.near, np.isfinite, "finite")
         ahead, behind = self.focus - self.near, self.far - self.focus
         check("FocusPlanes(near)", ahead, lambda v: v > 0, "before `focus` (focus - near > 0)")
         check("FocusPlanes(far)", behind, lambda v: v > 0, "behind `focus` (far - focus > 0)")
-        check("FocusPlanes(max_coc)", self.max_coc, lambda v: v >= 0, "0 or positive")
 
     @property
     def focus_distance(self) -> Float[Array, ""]:
@@ -207,32 +346,37 @@ class FocusPlanes(eqx.Module):
         valid = _all_positive(focus - near, far - focus) & (max_coc >= 0)
         # Beyond the planes nothing changes; an infinite quotient would have a NaN derivative.
         depth = jnp.where(depth >= far, far, jnp.where(depth <= near, near, depth))
-        ahead = clip01((focus - depth) / (focus - near))
-        behind = clip01((depth - focus) / (far - focus))
+        is_ahead = depth < focus
+        ahead = clip01((focus - jnp.where(is_ahead, depth, focus)) / (focus - near))
+        ends = far < jnp.inf
+        behind = jnp.where(ends, depth - focus, 0) / jnp.where(ends, far - focus, 1)
+        behind = clip01(behind)
         scale = jnp.where(valid, max_coc, jnp.nan)
-        return scale, jnp.where(depth < focus, -ahead, behind)
+        return scale, jnp.where(is_ahead, -ahead, behind)
 
-    def defocus(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def defocus(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Signed diameter of the circle of confusion.
 
-        **Arguments:** `depth`: any shape, scene units; inf is allowed.
+        **Arguments:** `depth`: any shape, scene units, floats or integers; inf is allowed.
 
-        **Returns:** pixels, in the type of `depth`, within `[-max_coc, max_coc]`: negative in
-        front of the focus plane.
+        **Returns:** pixels, in the type of `depth`, of integers in JAX's default float type,
+        within `[-max_coc, max_coc]`: negative in front of the focus plane.
+
+        **Raises:** `ValueError` for what is no array of numbers, or a batch of lenses.
 
         **Gradient:** exact, with zero where clamped.
         """
-        scale, ramp = self._factors(jnp.asarray(depth))
-        return scale * ramp
+        return _measured(self, "defocus", depth, lambda ramp: ramp)
 
-    def circle_of_confusion(self, depth: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def circle_of_confusion(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Diameter of the circle of confusion: `|defocus(depth)|`.
 
-        **Arguments:** `depth`: any shape, scene units; inf is allowed.
+        **Arguments:** `depth`: any shape, scene units, floats or integers; inf is allowed.
 
-        **Returns:** pixels, in the type of `depth`.
+        **Returns:** pixels, in the type of `depth`, of integers in JAX's default float type.
+
+        **Raises:** `ValueError` as `defocus`.
 
         **Gradient:** exact; on the focus plane, a kink, the one from behind it.
         """
-        scale, ramp = self._factors(jnp.asarray(depth))
-        return scale * absolute(ramp)
+        return _measured(self, "circle_of_confusion", depth, absolute)

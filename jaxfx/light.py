@@ -1,19 +1,32 @@
 """Lights. `direction` is the way the light travels; colours are linear RGB."""
 
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, parameter
+from jaxfx._checks import check, parameter
 
 
 __all__ = ["AmbientLight", "DirectionalLight", "Light", "PointLight", "SpotLight"]
 
 
+def _vector(name: str, value: Any) -> Float[Array, "3"]:
+    vector = parameter(name, value, (3,))
+    check(name, vector, np.isfinite, "finite")
+    return vector
+
+
+def _color(name: str, value: Any) -> Float[Array, "3"]:
+    color = parameter(name, value, (3,))
+    check(name, color, lambda v: ~np.isnan(v), "three numbers")
+    return color
+
+
 def _direction(name: str, value: Any) -> Float[Array, "3"]:
-    direction = parameter(name, value, (3,))
+    direction = _vector(name, value)
     check(name, direction, lambda v: v.any(), "a vector other than zero")
     return direction
 
@@ -24,15 +37,17 @@ class AmbientLight(eqx.Module):
 
     **Arguments:** `color`: 3, linear RGB irradiance.
 
-    **Raises:** `ValueError` for a wrong shape.
+    **Raises:** `ValueError` for a wrong shape or a NaN.
 
     **Gradient:** exact.
     """
 
+    SHAPES: ClassVar = {"color": (3,)}
+
     color: Float[Array, "3"]
 
     def __init__(self, color: Any):
-        self.color = parameter("AmbientLight(color)", color, (3,))
+        self.color = _color("AmbientLight(color)", color)
 
 
 @final
@@ -44,17 +59,19 @@ class DirectionalLight(eqx.Module):
     - `direction`: 3, the way the light travels, in world space; any length but zero.
     - `color`: 3, linear RGB irradiance on a surface that faces it.
 
-    **Raises:** `ValueError` for a wrong shape or a zero direction.
+    **Raises:** `ValueError` for a wrong shape, a number that is not finite or a zero direction.
 
     **Gradient:** exact.
     """
+
+    SHAPES: ClassVar = {"direction": (3,), "color": (3,)}
 
     direction: Float[Array, "3"]
     color: Float[Array, "3"]
 
     def __init__(self, direction: Any, color: Any):
         self.direction = _direction("DirectionalLight(direction)", direction)
-        self.color = parameter("DirectionalLight(color)", color, (3,))
+        self.color = _color("DirectionalLight(color)", color)
 
 
 @final
@@ -66,17 +83,19 @@ class PointLight(eqx.Module):
     - `position`: 3, in world space.
     - `color`: 3, linear RGB intensity: irradiance at distance 1.
 
-    **Raises:** `ValueError` for a wrong shape.
+    **Raises:** `ValueError` for a wrong shape or a number that is not finite.
 
     **Gradient:** exact.
     """
+
+    SHAPES: ClassVar = {"position": (3,), "color": (3,)}
 
     position: Float[Array, "3"]
     color: Float[Array, "3"]
 
     def __init__(self, position: Any, color: Any):
-        self.position = parameter("PointLight(position)", position, (3,))
-        self.color = parameter("PointLight(color)", color, (3,))
+        self.position = _vector("PointLight(position)", position)
+        self.color = _color("PointLight(color)", color)
 
 
 @final
@@ -91,10 +110,17 @@ class SpotLight(eqx.Module):
     - `inner_angle`, `outer_angle`: radians from the axis, `0 <= inner_angle < outer_angle <=
       pi`.
 
-    **Raises:** `ValueError` for a wrong shape, a zero direction or angles out of order.
+    **Raises:** `ValueError` for a wrong shape, a number that is not finite, a zero direction or
+    angles out of order. Traced values can't be looked at: a cone whose angles are out of order
+    is dark.
 
     **Gradient:** exact.
     """
+
+    SHAPES: ClassVar = {
+        **dict.fromkeys(("position", "direction", "color"), (3,)),
+        **dict.fromkeys(("inner_angle", "outer_angle"), ()),
+    }
 
     position: Float[Array, "3"]
     direction: Float[Array, "3"]
@@ -105,9 +131,9 @@ class SpotLight(eqx.Module):
     def __init__(
         self, position: Any, direction: Any, color: Any, inner_angle: Any, outer_angle: Any
     ):
-        self.position = parameter("SpotLight(position)", position, (3,))
+        self.position = _vector("SpotLight(position)", position)
         self.direction = _direction("SpotLight(direction)", direction)
-        self.color = parameter("SpotLight(color)", color, (3,))
+        self.color = _color("SpotLight(color)", color)
         self.inner_angle = parameter("SpotLight(inner_angle)", inner_angle)
         self.outer_angle = parameter("SpotLight(outer_angle)", outer_angle)
         check("SpotLight(inner_angle)", self.inner_angle, lambda v: v >= 0, "0 or positive")

@@ -11,7 +11,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import check, check_image, is_concrete, parameter, working_dtype
+from jaxfx._checks import as_array, check, check_image, is_concrete, option, parameter
+from jaxfx._numerics import working_dtype
 
 
 __all__ = ["psnr", "ssim"]
@@ -30,7 +31,7 @@ def _pair(
         )
     name = f"{function}(data_range=...)"
     data_range = parameter(name, data_range)
-    check(name, data_range, lambda v: v > 0, "positive")
+    check(name, data_range, lambda v: (v > 0) & (v < np.inf), "positive")
     dtype = working_dtype(image.dtype, reference.dtype)
     return image.astype(dtype), reference.astype(dtype), data_range.astype(dtype)
 
@@ -65,7 +66,7 @@ def psnr(
     error = image - reference
     count = np.prod(error.shape)
     if mask is not None:
-        mask = jnp.asarray(mask)
+        mask = as_array("psnr(mask=...)", mask)
         if mask.shape != error.shape[:2] or mask.dtype != jnp.bool_:
             raise ValueError(
                 f"`psnr(mask=...)` must hold booleans of shape {error.shape[:2]}, "
@@ -119,8 +120,7 @@ def ssim(
 
     Source: Wang, Bovik, Sheikh & Simoncelli 2004, eq. 13, with K1 = 0.01 and K2 = 0.03.
     """
-    if window not in _WINDOWS:
-        raise ValueError(f"`ssim(window=...)` must be one of {[*_WINDOWS]}, got {window!r}.")
+    option("ssim(window=...)", window, tuple(_WINDOWS))
     image, reference, data_range = _pair("ssim", image, reference, data_range)
     size = len(_WINDOWS[window][0])
     if min(image.shape[:2]) < size:

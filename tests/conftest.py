@@ -1,10 +1,11 @@
+import contextlib
 import gc
 from pathlib import Path
 
 import jax
 import pytest
 
-from tests.helpers.quick import quickly
+from tests.helpers import quick as compiling
 
 
 jax.config.update("jax_enable_x64", True)
@@ -59,11 +60,25 @@ def forget_programs():
         jax.clear_caches()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def quick_by_default(is_full):
+    """Compile with little optimisation in the quick form, as users do in the full one."""
+    with contextlib.nullcontext() if is_full else compiling.quickly():
+        yield
+
+
 @pytest.fixture
 def quick():
     """Compile with little optimisation, in half to three quarters of the time.
 
     `tests/test_transforms.py` compares every function with and without it.
     """
-    with quickly():
+    with compiling.quickly():
+        yield
+
+
+@pytest.fixture
+def optimised():
+    """Compile with all optimisation: for tests of what a program costs."""
+    with compiling.optimised():
         yield

@@ -101,6 +101,6 @@ def test_errors_of_the_shader(shader):
 
 def test_errors_of_types():
     with pytest.raises(
-        ValueError, match=r"`GBuffer\(depth\)` must be a real number, got complex"
+        ValueError, match=r"`GBuffer\(depth\)` must hold real numbers, got complex"
     ):
         GBuffer(**fields() | {"depth": np.zeros((4, 5), complex)})

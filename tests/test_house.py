@@ -22,16 +22,10 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
 NUMERICS = {
-    "_extras",
-    "_filter",
-    "_linear",
-    "_numerics",
-    "_tiles",
-    "_progress",
-    "_pyramid",
-    "_sampling",
+    *("_checks", "_extras", "_filter", "_linear", "_numerics", "_tiles", "_progress"),
+    *("_pyramid", "_sampling"),
 }
-TYPES = {"camera", "lens", "light", "gbuffer"}
+TYPES = {"_arguments", "camera", "lens", "light", "gbuffer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}
@@ -246,10 +240,11 @@ def _is_array(annotation):
 
 
 def _signature_complaints(value, sections):
+    is_protocol = getattr(value, "_is_protocol", False)  # It is never called.
     parameters = [
         parameter
         for parameter in inspect.signature(value).parameters.values()
-        if parameter.name not in ("self", "cls")
+        if parameter.name not in ("self", "cls") and not is_protocol
     ]
     section = sections["Arguments" if "Arguments" in sections else "Summary"]
     items = _items(section, [parameter.name for parameter in parameters])
@@ -279,7 +274,8 @@ def _is_effect(value):
 
 def _docstring_complaints(value, sections):
     returns = inspect.signature(value).return_annotation
-    is_record = "Arguments" not in sections and not _is_function(value)
+    is_protocol = getattr(value, "_is_protocol", False)
+    is_record = is_protocol or ("Arguments" not in sections and not _is_function(value))
     if _is_function(value) and returns is not None and "Returns" not in sections:
         yield "no **Returns:**"
     gradient = sections.get("Gradient", "")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx import FocusPlanes, PinholeCamera, ThinLens
+from jaxfx import FocusPlanes, Lens, OrthographicCamera, PinholeCamera, ThinLens
 from tests.helpers.quick import check_slopes
 
 
@@ -55,6 +55,119 @@ def test_a_50_mm_lens_at_f_2():
     np.testing.assert_allclose(lens.defocus(jnp.array(4000.0)), expected, rtol=1e-12)
     same = ThinLens.from_physical(aperture=25, **arguments)
     np.testing.assert_allclose(jax.tree.leaves(same), jax.tree.leaves(lens), rtol=1e-12)
+
+
+def test_from_sensor_is_the_cone_of_rays_through_a_fixed_sensor():
+    """A pixel's rays leave a disc of `F / f_stop` and meet in the plane in focus."""
+    focal_length, f_stop, focus, sensor, width = 0.05, 2.8, 2.6, 0.036, 1920
+    lens = ThinLens.from_sensor(focal_length, f_stop, focus, sensor, width)
+    for depth in (0.7, 2.6, 9.0):
+        # By similar triangles: as wide there, in the scene, as the pinhole makes so many pixels.
+        across = focal_length / f_stop * abs(depth - focus) / focus
+        pixels = across / depth * focal_length / sensor * width
+        coc = lens.circle_of_confusion(depth)
+        np.testing.assert_allclose(coc, pixels, rtol=1e-12, atol=1e-12)
+    camera = PinholeCamera.from_blender(
+        np.eye(4), lens=focal_length, sensor_width=sensor, height=1080, width=width
+    )
+    np.testing.assert_allclose(lens.focal_pixels, camera.intrinsics[0, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("focus", "share"), [(np.inf, 0), (1e9, 0), (2.6, 0.0196), (0.95, 0.0556)]
+)
+def test_from_sensor_beside_a_lens_that_moves(focus, share):
+    fixed = ThinLens.from_sensor(0.05, 2.8, focus, 0.036, 1920)
+    moved = ThinLens.from_physical(
+        focal_length=0.05, f_number=2.8, focus_distance=focus, pixels_per_unit=1920 / 0.036
+    )
+    np.testing.assert_allclose(fixed.aperture, moved.aperture, rtol=1e-12)
+    ratio = float(moved.focal_pixels / fixed.focal_pixels)
+    assert ratio - 1 == pytest.approx(share, abs=5e-5)
+
+
+INTEGERS = np.array([[1, 2], [3, 40]])
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("lens", [ThinLens(25.7, 15.5, 525.0), FocusPlanes(0.5, 2.5, 30, 7.3)])
+def test_integers_lists_and_other_byte_orders_are_depths(lens, method):
+    expected = getattr(lens, method)(INTEGERS.astype(float))
+    for given in (INTEGERS, INTEGERS.tolist(), INTEGERS.astype(np.uint16), INTEGERS * 1.0):
+        found = getattr(lens, method)(given)
+        assert found.dtype == jnp.float64
+        np.testing.assert_array_equal(found, expected)
+    for kind in (">f4", ">f8", ">u2"):
+        found = getattr(lens, method)(INTEGERS.astype(kind))
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert getattr(lens, method)(3).shape == ()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "lens", [ThinLens(50.0, 2000.0, 1500.0), FocusPlanes(100.0, 2000.0, 60000.0, 7.3)]
+)
+def test_half_floats_do_not_overflow_inside(lens, method):
+    depth = np.float16([500, 2000, 3000, 60000, np.inf])
+    found = getattr(lens, method)(depth)
+    assert found.dtype == jnp.float16
+    exact = np.asarray(getattr(lens, method)(depth.astype(float)))
+    np.testing.assert_allclose(found.astype(float), exact, rtol=1e-3, atol=1e-3)
+
+
+def test_planes_that_end_nowhere():
+    """Behind the focus all is sharp: the ramp to inf never begins to rise."""
+    planes = FocusPlanes(0.5, 2.0, np.inf, 6.0)
+    depth = jnp.array([0.25, 1.0, 2.0, 3.0, 1e30, np.inf])
+    np.testing.assert_allclose(planes.defocus(depth), [-6, -4, 0, 0, 0, 0])
+    np.testing.assert_allclose(planes.circle_of_confusion(depth), [6, 4, 0, 0, 0, 0])
+    far = FocusPlanes(0.5, 2.0, 1e30, 6.0)
+    np.testing.assert_allclose(planes.defocus(depth[:4]), far.defocus(depth[:4]), atol=1e-12)
+    for method in METHODS:
+        total = lambda lens, depth, method=method: jnp.sum(getattr(lens, method)(depth))
+        for mode in (jax.grad, jax.jacfwd):
+            slopes = jax.jit(mode(total, (0, 1)))(planes, depth)
+            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+            assert slopes[0].far == 0
+            np.testing.assert_allclose(np.abs(slopes[1]), [0, 4, *[0] * 4], atol=1e-12)
+    traced = jax.jit(lambda far: FocusPlanes(0.5, 2.0, far, 6.0).defocus(depth))(jnp.inf)
+    np.testing.assert_allclose(traced, [-6, -4, 0, 0, 0, 0])
+
+
+def test_focus_at_infinity():
+    lens = ThinLens(0.1, np.inf, 100.0)
+    np.testing.assert_allclose(
+        lens.circle_of_confusion(jnp.array([2.0, 50, np.inf])), [5, 0.2, 0]
+    )
+
+
+@pytest.mark.parametrize("kind", [ThinLens, FocusPlanes])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_batch_of_lenses_without_vmap(kind, method):
+    lens = {ThinLens: LENS, FocusPlanes: PLANES}[kind]
+    lenses = jax.tree.map(lambda x: jnp.stack([x, x, x]), lens)
+    message = rf"`{kind.__name__}.{method}` must be one {kind.__name__}, whose .* `jax.vmap`"
+    for depth in (jnp.ones(3), jnp.ones((2, 3)), 1.0):
+        with pytest.raises(ValueError, match=message):
+            getattr(lenses, method)(depth)
+    batch = jax.vmap(lambda lens: getattr(lens, method)(jnp.ones((2, 3))))(lenses)
+    assert batch.shape == (3, 2, 3)
+
+
+def test_what_is_a_lens():
+    class Own:
+        focus_distance = 2.0
+
+        def defocus(self, depth):
+            return depth
+
+        def circle_of_confusion(self, depth):
+            return depth
+
+    for lens in (LENS, PLANES, Own()):
+        assert isinstance(lens, Lens)
+    for other in (0.1, None, "lens", np.ones(3), PinholeCamera.from_fov(1, height=1, width=1)):
+        assert not isinstance(other, Lens)
 
 
 def test_thin_lens_formula():
@@ -229,6 +342,11 @@ def physical(**changes):
     return ThinLens.from_physical(**(arguments | changes))
 
 
+def sensor(**changes):
+    arguments = {"focal_length": 50, "f_stop": 2, "focus_distance": 3000, "sensor_width": 36}
+    return ThinLens.from_sensor(**({"width": 640} | arguments | changes))
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -263,6 +381,27 @@ def physical(**changes):
         (lambda: FocusPlanes(2, 2, 5, 1), r"`FocusPlanes\(near\)` must be before `focus`"),
         (lambda: FocusPlanes(1, 2, 2, 1), r"`FocusPlanes\(far\)` must be behind `focus`"),
         (lambda: FocusPlanes(1, 2, 3, -1), r"`FocusPlanes\(max_coc\)` must be 0 or positive"),
+        (lambda: FocusPlanes(1, 2, 3, np.inf), r"`FocusPlanes\(max_coc\)` must be 0 or positi"),
+        (
+            lambda: FocusPlanes(np.nan, 2, 3, 1),
+            r"`FocusPlanes\(near\)` must be finite, got nan",
+        ),
+        (lambda: FocusPlanes(1, np.inf, np.inf, 1), r"`FocusPlanes\(far\)` must be behind"),
+        (lambda: ThinLens(np.inf, 2, 3), r"`ThinLens\(aperture\)` must be 0 or positive, got"),
+        (lambda: ThinLens(1, np.nan, 3), r"`ThinLens\(focus_distance\)` must be positive, got"),
+        (
+            lambda: ThinLens(1, 2, np.inf),
+            r"`ThinLens\(focal_pixels\)` must be positive, got inf",
+        ),
+        (lambda: physical(f_number=0), r"`from_physical\(f_number=...\)` must be positive"),
+        (lambda: sensor(f_stop=-1), r"`from_sensor\(f_stop\)` must be positive, got -1"),
+        (lambda: sensor(width=2.5), r"`from_sensor\(width\)` must be a positive integer"),
+        (
+            lambda: ThinLens.from_camera(
+                OrthographicCamera(1, [0, 0], np.eye(4)), aperture=1, focus_distance=2
+            ),
+            r"`from_camera\(camera\)` must be a PinholeCamera, got OrthographicCamera",
+        ),
     ],
 )
 def test_errors(call, message):

@@ -306,8 +306,15 @@ for _name, _function in FUNCTIONS.items():
 
 
 def each(cases):
-    """Parametrize by cases, so that a case's tests follow one another and share `program`."""
-    return pytest.mark.parametrize("case", cases.values(), ids=cases.keys(), scope="module")
+    """Parametrize by cases, so that a case's tests follow one another and share `program`.
+
+    The quick form of the suite takes the first case of each function: its default options.
+    """
+    values = [
+        pytest.param(case, id=name, marks=() if name in FUNCTIONS else pytest.mark.full)
+        for name, case in cases.items()
+    ]
+    return pytest.mark.parametrize("case", values, scope="module")
 
 
 @functools.lru_cache(maxsize=1)
@@ -345,6 +352,7 @@ def test_every_argument_and_choice_is_exercised(name):
 
 
 @each(CASES)
+@pytest.mark.full
 def test_jit(case):
     compiled, call, arguments = program(case)
     with quickly():
@@ -362,7 +370,9 @@ def test_vmap_is_a_loop(case):
 
 
 @each(CASES)
-@pytest.mark.parametrize("parameters", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "parameters", [np.float32, pytest.param(np.float64, marks=pytest.mark.full)]
+)
 def test_float32_stays_and_is_close_to_float64(case, parameters):
     call, arguments = case.split(dtype=np.float32, parameters=parameters)
     compiled, _, same = program(case)
@@ -414,6 +424,7 @@ PICTURES = {name: case for name, case in OPTIONS.items() if not name.startswith(
 
 
 @each(OPTIONS)
+@pytest.mark.full
 def test_nested_gradient_is_finite(case):
     call, arguments = case.split()
     along = _normal(arguments)
@@ -428,6 +439,7 @@ def test_nested_gradient_is_finite(case):
 
 @each(PICTURES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 7)], ids="{0[0]}x{0[1]}".format)
+@pytest.mark.full
 def test_any_size(case, size):
     call, arguments = case.split(size=size)
 

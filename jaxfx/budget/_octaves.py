@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import clip01, working_dtype
+from jaxfx._numerics import clip01
+from jaxfx.dof._inputs import pixels, with_own
 from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.dof._tiles import tiles
 from jaxfx.dof.scatter import cheapest, to_sprites
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 EPSILON = 2.0
@@ -24,7 +25,7 @@ _Values = Float[Array, "height width value"]
 def octaves(
     image: Float[Array, "height width channel"],
     depth: Float[Array, "height width"],
-    lens: ThinLens | FocusPlanes,
+    lens: Lens,
     max_coc: float,
     split: float,
 ) -> Float[Array, "height width channel"]:
@@ -36,9 +37,9 @@ def octaves(
     sprites of three times epsilon and more, the leak rejection is a factor of the destination.
     """
     dtype = image.dtype
-    image, depth = (x.astype(working_dtype(dtype)) for x in (image, depth))
+    image, depth, missing, _, _ = pixels(image, depth, lens)
     gamma, epsilon = jnp.zeros((), image.dtype), jnp.asarray(EPSILON, image.dtype)
-    sprites = to_sprites(image, depth, lens, gamma, epsilon, max_coc)
+    sprites = to_sprites(image, depth, lens, gamma, epsilon, max_coc, missing)
 
     large = sprites.radius > split / 2
     sums = _painted(_without(sprites, large), split)
@@ -48,7 +49,7 @@ def octaves(
     coarse = _coarse(jnp.concatenate(planes, axis=-1), sprites.radius, large, max_coc, split)
     front, back = jnp.split(_enlarged(coarse, depth.shape), 2, axis=-1)
     passed = clip01(sprites.coc / EPSILON - 1)[..., None]
-    sums = sums + front + passed * back
+    sums = with_own(sums + front + passed * back, image, missing)
     return (sums[..., :-1] / sums[..., -1:]).astype(dtype)
 
 

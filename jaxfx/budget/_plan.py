@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import is_concrete
+from jaxfx._checks import is_concrete, number
 
 
 # How far a way may err on parts of a scene to be measured on all of it: first the quickest that
@@ -141,22 +141,20 @@ class Search:
 
 def check_call(name: str, max_error: Any, data: Any) -> float:
     """`max_error` as a number; `ValueError` if it is none or the scene can't be looked at."""
-    if isinstance(max_error, bool) or not isinstance(max_error, int | float) or max_error < 0:
-        raise ValueError(
-            f"`{name}(max_error=...)` must be a number, 0 or positive, got {max_error!r}."
-        )
+    expected = "a number, 0 or positive"
+    max_error = number(f"{name}(max_error=...)", max_error, lambda x: x >= 0, expected)
     if not is_concrete(data):
         raise ValueError(
             f"`{name}(...)` must be given concrete data, outside `jit`, `grad` and `vmap`: a "
             "plan is made for one scene. The plan itself may be called anywhere."
         )
-    return float(max_error)
+    return max_error
 
 
 def timed(call: Any, data: Sequence[Any]) -> tuple[Any, float]:
     """The picture that a call gives, and the seconds it takes once it is compiled."""
     leaves, structure = jax.tree.flatten((call, data))
-    kinds = [(np.shape(leaf), getattr(leaf, "dtype", leaf)) for leaf in leaves]
+    kinds = [(np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves]
     program = (structure, *kinds)
     if program not in _called:
         jax.block_until_ready(call(*data))

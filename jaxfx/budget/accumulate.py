@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfx._checks import Number
 from jaxfx.budget._plan import Plan, check_call, plan
 from jaxfx.camera import PinholeCamera
 from jaxfx.dof.accumulate import accumulate as passes
@@ -36,7 +37,7 @@ def accumulate(
     camera: PinholeCamera,
     lens: ThinLens,
     *,
-    max_error: int | float,
+    max_error: Number,
 ) -> Plan:
     """The passes of `dof.accumulate` that bring it within an error of infinitely many.
 

@@ -7,18 +7,20 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
-from jaxfx._numerics import check_depth, check_image
+from jaxfx._arguments import check_lens
+from jaxfx._checks import Number, check_depth, check_image, option
 from jaxfx.budget._octaves import octaves
 from jaxfx.budget._plan import Part, Plan, Search, Trial, check_call, plan
+from jaxfx.dof._inputs import compiled, largest_coc, largest_of
 from jaxfx.dof.blend import blend
 from jaxfx.dof.diffusion import implicit_diffusion
 from jaxfx.dof.gather import gather
 from jaxfx.dof.layered import layered
-from jaxfx.dof.scatter import cheapest, largest_coc, scatter
+from jaxfx.dof.scatter import cheapest, scatter
 from jaxfx.dof.separable import separable
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 # From which size on to try sprites at lower resolutions, in pixels; not below 3 epsilon.
@@ -34,10 +36,15 @@ def _nothing(image: Any, depth: Any, lens: Any) -> Any:
     return jnp.asarray(image)
 
 
+def _in_octaves(image: Any, depth: Any, lens: Any, **options: Any) -> Any:
+    image, depth = jnp.asarray(image), jnp.asarray(depth)
+    return octaves(image, depth, compiled("dof", lens, depth), **options)
+
+
 _METHODS = {
     "nothing": _nothing,
     "scatter": scatter,
-    "scatter in octaves": octaves,
+    "scatter in octaves": _in_octaves,
     "layered": layered,
     "separable": separable,
     "blend": blend,
@@ -71,10 +78,10 @@ class Method(eqx.Module):
 
 def dof(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_error: int | float,
+    max_error: Number,
     target: Literal["scatter", "layered"] = "scatter",
 ) -> Plan:
     """The quickest depth of field within an error of `dof.scatter`.
@@ -97,7 +104,8 @@ def dof(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_error`: root mean square, linear image units, over all pixels and channels.
     - `target`: the effect that is approached: `dof.scatter` with `gamma=0`, `epsilon=2` and
@@ -114,9 +122,11 @@ def dof(
     max_error = check_call("dof", max_error, (image, depth, lens))
     image = check_image("dof(image)", image)
     depth = check_depth("dof(depth)", depth, image.shape[:2])
-    if target not in ("scatter", "layered"):
-        raise ValueError(f'`dof(target=...)` must be "scatter" or "layered", got {target!r}.')
-    widest = float(jnp.nanmax(lens.circle_of_confusion(depth)))
+    check_lens("dof(lens)", lens)
+    option("dof(target=...)", target, ("scatter", "layered"))
+    widest = largest_of("dof", depth, lens)
+    if widest is None:
+        raise ValueError("`dof(lens)` must be concrete, got a lens that holds traced values.")
     if widest <= 1 and target == "scatter":
         why = f"no circle of confusion passes its pixel: the largest is {widest:.2g} pixels."
         return plan(Method("nothing"), 0.0, 0.0, float("nan"), [f"all, for {why}"])
@@ -160,7 +170,8 @@ def _parts(image: Any, depth: Any, lens: Any, largest: float) -> list[Part]:
         return []
     bright = np.asarray(image).sum(axis=-1)
     change = sum(np.abs(np.diff(bright, axis=axis, append=0)) for axis in (0, 1))
-    matters = np.nan_to_num(change * np.asarray(lens.circle_of_confusion(depth)))
+    circles = np.asarray(compiled("dof", lens, depth).circle_of_confusion(depth))
+    matters = np.nan_to_num(change * np.where(np.asarray(depth) > 0, circles, 0))
     matters = matters[: rows * side, : columns * side].reshape(rows, side, columns, side)
     matters = matters.sum(axis=(1, 3)).ravel() + 1e-9
     order = np.argsort(-matters)

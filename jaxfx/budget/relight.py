@@ -7,16 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from jaxfx._arguments import check_camera, check_gbuffer, check_lights
+from jaxfx._checks import Number, shares
 from jaxfx._numerics import working_dtype
 from jaxfx.budget._plan import Part, Plan, Search, Trial, check_call
 from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of, tile_sums
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import Light
-from jaxfx.relight.shading import Surface, reflected, render, to_surface
+from jaxfx.relight.shading import Surface, check_shader, reflected, render, to_surface
 
 
 # A light that is needed in more of the picture is computed in all of it: single pixels cost so
@@ -90,8 +91,8 @@ def relight(
     camera: PinholeCamera | OrthographicCamera,
     lights: Sequence[Light],
     *,
-    max_error: int | float,
-    visibilities: Sequence[Float[ArrayLike, "height width"] | None] | None = None,
+    max_error: Number,
+    visibilities: Sequence[Any] | None = None,
 ) -> Plan:
     """The fewest lights within an error of `relight.render` under all of them.
 
@@ -128,13 +129,18 @@ def relight(
     Source: tiles with their own lights are Olsson & Assarsson's 2011, tiled shading; one light
     for a near and dim group is Walter et al.'s 2005, lightcuts.
     """
-    data = (gbuffer, camera, tuple(lights))
-    data = data if visibilities is None else (*data, tuple(visibilities))
+    gbuffer = check_shader(check_gbuffer("relight(gbuffer)", gbuffer))
+    check_camera("relight(camera)", camera)
+    lights = check_lights("relight(lights)", lights)
+    name, shape = "relight(visibilities=...)", gbuffer.depth.shape
+    visible = tuple(shares(name, visibilities, len(lights), shape))
+    data = (gbuffer, camera, lights)
+    data = data if visibilities is None else (*data, visible)
     max_error = check_call("relight", max_error, data)
     parts = _parts(gbuffer, camera, *data[2:])
     search = Search(Everything(), data, max_error, parts)
     if lights:
-        brought = _bring(gbuffer, camera, lights, visibilities or [None] * len(lights))
+        brought = _bring(gbuffer, camera, lights, visible)
         _try_merging(search, brought, lights)
         _try_tiles(search, brought)
     return search.plan()

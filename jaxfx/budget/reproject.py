@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxfx._checks import Number
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
@@ -66,12 +67,12 @@ class Blend(eqx.Module):
 
 def reproject(
     images: Sequence[Float[ArrayLike, "height width channel"]],
-    depths: Sequence[Float[ArrayLike, "height width"]],
+    depths: Sequence[Num[ArrayLike, "height width"]],
     sources: Sequence[PinholeCamera],
     target: PinholeCamera | OrthographicCamera,
     *,
     shape: tuple[int, int] | None = None,
-    max_error: int | float,
+    max_error: Number,
 ) -> Plan:
     """The fewest rays within an error of `reproject.blend` of all sources, "pyramid".
 

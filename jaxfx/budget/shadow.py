@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._numerics import parameter
+from jaxfx._checks import Number, WholeNumber, parameter
 from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
 from jaxfx.shadow import _taps
@@ -97,13 +97,13 @@ def _at(size, pixels, shadow_map, receivers, bias, slope_bias):
 
 
 def shadow(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
-    max_error: int | float,
+    max_error: Number,
 ) -> Plan:
     """The quickest shadow within an error of `shadow.pcf` with a filter of `size`.
 
@@ -131,10 +131,14 @@ def shadow(
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    given = lambda name, each: None if each is None else parameter(f"shadow({name}=...)", each)
-    biases = given("bias", bias), given("slope_bias", slope_bias)
+    checked = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)
+    is_left_out = bias is None and slope_bias is None
+    biases = (None, None) if is_left_out else (checked[2], checked[3])
+    # As given, the slope too: a bias that is left out is found anew for other receivers.
+    slope = parameter("shadow(receivers.slope)", receivers.slope, None)
+    shadow_map, receivers, size = checked[0], checked[1]._replace(slope=slope), int(size)
     where = candidates(
-        shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1], mask="depth"
+        shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1]
     ).where
     share = float(jnp.mean(where))
     by = lambda less, masked=True: Filter(*biases, size, less, masked)

@@ -7,22 +7,18 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfx.dof._sprites import POINT_RADIUS, reach
 from jaxfx.dof._tiles import sum_all
-from jaxfx.lens import FocusPlanes, ThinLens
 
 
 def spoiled(
     bad: Bool[Array, "height width"],
-    depth: Float[Array, "height width"],
-    lens: ThinLens | FocusPlanes,
+    coc: Float[Array, "height width"],
     max_coc: int | float,
 ) -> Bool[Array, "height width"]:
-    """Where the sprites of the `bad` pixels reach, the largest where a depth is no depth.
+    """Where the sprites of the `bad` pixels reach, of a circle that is not known the largest.
 
     If there are none, nothing is computed; in a batch, for no image that has none.
     """
-    coc = lens.circle_of_confusion(depth)
-    is_known = (coc < max_coc) & (depth >= 0)
-    diameter = jnp.where(is_known, jnp.maximum(coc, 2 * POINT_RADIUS), max_coc)
+    diameter = jnp.where(coc < max_coc, jnp.maximum(coc, 2 * POINT_RADIUS), max_coc)
     # What the other pixels reach costs nothing then.
     radius = jax.lax.stop_gradient(jnp.where(bad, diameter / 2, POINT_RADIUS))
 

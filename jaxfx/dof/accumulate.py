@@ -8,7 +8,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import safe_sqrt
+from jaxfx._arguments import check_camera, check_lens
+from jaxfx._checks import WholeNumber, check_image, parameter, whole_number
+from jaxfx._numerics import safe_sqrt, working_dtype
 from jaxfx._progress import counted
 from jaxfx.camera import PinholeCamera
 from jaxfx.lens import ThinLens
@@ -31,9 +33,9 @@ def accumulate(
     camera: PinholeCamera,
     lens: ThinLens,
     *,
-    samples: int = 256,
+    samples: WholeNumber = 256,
     jitter: bool = True,
-    seed: int = 0,
+    seed: WholeNumber = 0,
     progress: bool = False,
 ) -> Accumulation:
     """Depth of field by many passes: the mean of pictures from points all over the lens.
@@ -44,19 +46,21 @@ def accumulate(
     **Arguments:**
 
     - `render`: from a camera to an image, height width channel, linear radiance. Anything
-      serves: a rasteriser, a ray tracer, a reprojection of one picture.
+      serves: a rasteriser, a ray tracer, a reprojection of one picture. Integers are taken as
+      they are, for floats.
     - `camera`: the pinhole camera at the lens' centre.
     - `lens`: its `aperture` and `focus_distance` are used, in scene units.
-    - `samples`: how many passes.
+    - `samples`: static; how many passes.
     - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
       pixel.
-    - `seed`: turns the sequence to another of its kind.
+    - `seed`: static; an integer from 0, turns the sequence to another of its kind.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
-    **Returns:** an `Accumulation`: `image`, height width channel, and `convergence`.
+    **Returns:** an `Accumulation`: `image`, height width channel, in the renderer's float type
+    (JAX's default for integers), summed in float32 at least; and `convergence`.
 
     **Raises:** `ValueError` where `samples` is not a positive integer, the lens is not a
-    `ThinLens`, or a picture changes its shape on the way.
+    `ThinLens`, or a picture is none, or changes its shape on the way.
 
     **Gradient:** that of `render`, through its camera: exact in the aperture, the focus
     distance and the camera where `render` is. A rasteriser's is zero or missing.
@@ -64,21 +68,24 @@ def accumulate(
     Source: Haeberli & Akeley 1990, the accumulation buffer. The sequence is Roberts' 2018
     generalization of the golden ratio to four dimensions.
     """
+    check_camera("accumulate(camera)", camera, PinholeCamera)
     if not isinstance(lens, ThinLens):
         raise ValueError(f"`accumulate(lens)` must be a ThinLens, got {type(lens).__name__}.")
-    if not isinstance(samples, int) or samples < 1:
-        raise ValueError(
-            f"`accumulate(samples=...)` must be a positive integer, got {samples}."
-        )
+    check_lens("accumulate(lens)", lens)
+    samples = whole_number("accumulate(samples=...)", samples)
+    seed = whole_number("accumulate(seed=...)", seed, lambda n: n >= 0, "an integer from 0")
 
     offsets, shifts = lens_samples(samples, seed)
-    total = half = None
+    total = half = dtype = None
     for index in counted(range(samples), progress, "lens"):
         offset = lens.aperture * jnp.asarray(offsets[index], lens.aperture.dtype)
         eye = camera.through_lens(offset, focus_distance=lens.focus_distance)
         if jitter:
             eye = _shifted(eye, shifts[index])
-        image = jnp.asarray(render(eye))
+        name = "accumulate(render)"
+        image = check_image(name, parameter(name, render(eye), None))
+        dtype = image.dtype
+        image = image.astype(working_dtype(dtype))
         if total is not None and image.shape != total.shape:
             raise ValueError(
                 "`accumulate(render)` must give pictures of one shape, got "
@@ -90,8 +97,8 @@ def accumulate(
     assert total is not None
     mean = total / samples
     if half is None:
-        return Accumulation(mean, jnp.asarray(jnp.nan, mean.dtype))
-    return Accumulation(mean, safe_sqrt(jnp.mean((half - mean) ** 2)))
+        return Accumulation(mean.astype(dtype), jnp.asarray(jnp.nan, mean.dtype))
+    return Accumulation(mean.astype(dtype), safe_sqrt(jnp.mean((half - mean) ** 2)))
 
 
 def lens_samples(

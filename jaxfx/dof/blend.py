@@ -7,15 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
+from jaxfx._checks import Number
 from jaxfx._filter import folded
 from jaxfx._linear import linear
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._discs import vogel
 from jaxfx.dof._inputs import check_arguments, defocused
 from jaxfx.dof.gather import mix
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 _TAPS = 12
@@ -23,10 +24,10 @@ _TAPS = 12
 
 def blend(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
+    max_coc: Number | None = None,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by a blurred copy: `lerp(image, blur, clamp(C / max_coc))`.
 
@@ -38,16 +39,18 @@ def blend(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its circle of confusion C, in pixels.
     - `max_coc`: static; the diameter, in pixels, at which nothing of the sharp image is left.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    spoils the pixels out of focus whose taps read it, 0.71 `max_coc` + 2 away at the most.
+    spoils the pixels out of focus whose taps read it, 0.71 `max_coc` + 2 away at the most. One
+    whose depth is missing is left out of the blur, and keeps its own colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
-    or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, or no `max_coc`
+    under a transform.
 
     **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; zero where a
     circle is clamped.
@@ -56,7 +59,7 @@ def blend(
     `clamp(range * |focus - Z|)`. Reconstructed: where its 12 taps lie (here a Vogel spiral,
     with 1/sqrt(2) of the radius in each pass, so that both together have the disc's variance).
     """
-    image, depth, max_coc = check_arguments("blend", image, depth, lens, max_coc)
+    image, depth, lens, max_coc = check_arguments("blend", image, depth, lens, max_coc)
     return _blend(image, depth, lens, max_coc)
 
 
@@ -66,9 +69,14 @@ def _blend(image, depth, lens, max_coc):
     view = defocused(image, depth, lens, max_coc)
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
     kernel = taps_kernel(max_coc / 2 / math.sqrt(2))
-    blur = _filter(_filter(image, kernel), kernel)
+    # Pixels without a depth are left out; the last channel is how much is left.
+    planes = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
+    planes = jnp.where(view.missing[..., None], 0, planes)
+    planes = _filter(_filter(planes, kernel), kernel)
+    left = jnp.where(planes[..., -1:] > 0, planes[..., -1:], 1)
     share = clip01(absolute(view.defocus) / max_coc)
-    return mix(image, blur, share[..., None]).astype(dtype)
+    result = mix(image, planes[..., :-1] / left, share[..., None])
+    return jnp.where(view.lost[..., None], jnp.nan, result).astype(dtype)
 
 
 def taps_kernel(radius: float) -> Float[np.ndarray, "side side"]:

@@ -6,14 +6,15 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
+from jaxfx._checks import Number, WholeNumber, whole_number
 from jaxfx._numerics import absolute, clip01
-from jaxfx.dof._inputs import check_arguments, check_count, defocused
+from jaxfx.dof._inputs import check_arguments, defocused, with_own
 from jaxfx.dof._spoiled import spoiled
 from jaxfx.dof._sprites import POINT_RADIUS, coverage, reach, row_half_width
 from jaxfx.dof._tiles import sum_all
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 # Coverage below this is none.
@@ -22,11 +23,11 @@ _LEAST = 1e-12
 
 def depth_sorted(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
-    slices: int | Literal["all"] = 8,
+    max_coc: Number | None = None,
+    slices: WholeNumber | Literal["all"] = 8,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by point sprites in order of depth, with partial visibility.
 
@@ -44,7 +45,8 @@ def depth_sorted(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
@@ -53,10 +55,11 @@ def depth_sorted(
       sprite by its own depth, in time pixels times taps squared: the oracle.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    spoils `max_coc / 2` pixels about it, and no more.
+    spoils `max_coc / 2` pixels about it, and no more. One whose depth is missing has no sprite:
+    it shows what reaches it or, where nothing does, its own colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
-    a bad `slices`, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a bad `slices`, or no
+    `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; in the last
     two, zero where a circle is below a pixel or above `max_coc`. With `slices="all"` that of
@@ -67,28 +70,31 @@ def depth_sorted(
     sprites lets 1/e of what is behind through an opaque surface. Our own: slices that share
     sprites.
     """
-    image, depth, max_coc = check_arguments("depth_sorted", image, depth, lens, max_coc)
-    if slices != "all":
-        check_count("depth_sorted(slices=...)", slices)
+    image, depth, lens, max_coc = check_arguments("depth_sorted", image, depth, lens, max_coc)
+    if not (isinstance(slices, str) and slices == "all"):
+        expected = 'a positive integer or "all"'
+        slices = whole_number("depth_sorted(slices=...)", slices, expected=expected)
     return _depth_sorted(image, depth, lens, max_coc, slices)
 
 
 @ft.partial(jax.jit, static_argnames=("max_coc", "slices"))
 def _depth_sorted(image, depth, lens, max_coc, slices):
     dtype = image.dtype
-    image, defocus, bad = defocused(image, depth, lens, max_coc)
+    image, defocus, missing, lost, bad = defocused(image, depth, lens, max_coc)
     coc = absolute(defocus)
     radius = jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
     value = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
     value = value / (jnp.pi * radius * radius)[..., None]
+    value = jnp.where(missing[..., None], 0, value)
     far = reach(max_coc)
     if slices == "all":
         sums = _in_order(value, radius, depth.astype(image.dtype), far)
     else:
         sums = _in_slices(value, radius, defocus / max_coc, far, slices)
+    sums = with_own(sums, image, missing)
     result = sums[..., :-1] / sums[..., -1:]
 
-    spoils = spoiled(bad, depth.astype(image.dtype), lens, max_coc)
+    spoils = spoiled(bad, coc, max_coc) | lost
     return jnp.where(spoils[..., None], jnp.nan, result).astype(dtype)
 
 

@@ -12,11 +12,11 @@ import math
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import check, parameter
+from jaxfx._checks import Number, check, parameter
 from jaxfx.dof._inputs import Defocused, check_arguments, defocused
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 # Of a border; four of them then give a pixel's heat away and no more, so that nothing rings.
@@ -25,10 +25,10 @@ _LARGEST_CONDUCTANCE = 1 / 4
 
 def anisotropic_diffusion(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
+    max_coc: Number | None = None,
     edge: Float[ArrayLike, ""] | float = 4.0,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by explicit heat flow that stops at depth edges.
@@ -45,17 +45,18 @@ def anisotropic_diffusion(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_coc`: static; the largest diameter, in pixels. Larger ones are clamped to it. Outside
       `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
     - `edge`: pixels; a step of the defocus by this much halves the flow.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    conducts nothing, so it spoils itself alone.
+    conducts nothing, so it spoils itself alone; one whose depth is missing keeps its colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth or an `edge` that is
-    not positive, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, an `edge` that is not
+    positive, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `edge` and every field of `lens`; zero
     where a circle is clamped. Its memory grows with the root of the number of steps.
@@ -64,7 +65,7 @@ def anisotropic_diffusion(
     Reconstructed: the form of the stop at an edge. Our own: the scale of the conductance, which
     gives a point the variance of its disc.
     """
-    image, depth, max_coc = check_arguments(
+    image, depth, lens, max_coc = check_arguments(
         "anisotropic_diffusion", image, depth, lens, max_coc
     )
     edge = _check_edge("anisotropic_diffusion", edge)
@@ -73,10 +74,10 @@ def anisotropic_diffusion(
 
 def implicit_diffusion(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
+    max_coc: Number | None = None,
     edge: Float[ArrayLike, ""] | float = 4.0,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by two implicit steps of heat flow, in constant time at any radius.
@@ -90,17 +91,18 @@ def implicit_diffusion(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_coc`: static; the largest diameter, in pixels. Larger ones are clamped to it; the
       work does not depend on it. Outside `jit`, `grad` and `vmap` it may be left out.
     - `edge`: pixels; a step of the defocus by this much halves the flow.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    conducts nothing, so it spoils itself alone.
+    conducts nothing, so it spoils itself alone; one whose depth is missing keeps its colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth or an `edge` that is
-    not positive, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, an `edge` that is not
+    positive, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `edge` and every field of `lens`, by
     the implicit function, in the memory of a few images; zero where a circle is clamped.
@@ -110,7 +112,9 @@ def implicit_diffusion(
     keeps the foreground apart. Our own: the scale of the conductance, which gives a point the
     variance of its disc, and `edge`.
     """
-    image, depth, max_coc = check_arguments("implicit_diffusion", image, depth, lens, max_coc)
+    image, depth, lens, max_coc = check_arguments(
+        "implicit_diffusion", image, depth, lens, max_coc
+    )
     edge = _check_edge("implicit_diffusion", edge)
     return _implicit(image, depth, lens, edge, max_coc)
 
@@ -126,7 +130,7 @@ def _conductances(
     view: Defocused, edge: Float[Array, ""]
 ) -> tuple[Float[Array, "_ width"], Float[Array, "height _"]]:
     """Those of the borders between rows and between columns, for a time of 1."""
-    spread = jnp.where(view.bad, 0, view.defocus**2 / 32)
+    spread = jnp.where(view.bad | view.missing, 0, view.defocus**2 / 32)
     edge = edge.astype(spread.dtype)
 
     def between(axis):
@@ -167,7 +171,7 @@ def _explicit(image, depth, lens, edge, max_coc):
     channels = tuple(jnp.moveaxis(view.image, -1, 0))
     channels, _ = jax.lax.scan(steps_of_one, channels, None, outer)
     result = jnp.stack(channels, axis=-1)
-    return jnp.where(view.bad[..., None], jnp.nan, result).astype(image.dtype)
+    return jnp.where((view.bad | view.lost)[..., None], jnp.nan, result).astype(image.dtype)
 
 
 @ft.partial(jax.jit, static_argnames=("max_coc",))
@@ -178,7 +182,7 @@ def _implicit(image, depth, lens, edge, max_coc):
     heat = solve(columns.T, jnp.transpose(view.image, (1, 2, 0)))
     heat = solve(rows, jnp.transpose(heat, (2, 1, 0)))
     result = jnp.transpose(heat, (0, 2, 1))
-    return jnp.where(view.bad[..., None], jnp.nan, result).astype(image.dtype)
+    return jnp.where((view.bad | view.lost)[..., None], jnp.nan, result).astype(image.dtype)
 
 
 def solve(

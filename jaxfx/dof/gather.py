@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import absolute, check, clip01, parameter
+from jaxfx._checks import Number, WholeNumber, check, parameter, whole_number
+from jaxfx._numerics import absolute, clip01
 from jaxfx._sampling import bilinear, pixel_centers
 from jaxfx.dof._discs import POISSON, vogel
-from jaxfx.dof._inputs import check_arguments, check_count, defocused
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.dof._inputs import check_arguments, defocused, with_own
+from jaxfx.lens import Lens
 
 
 # The side of a low-resolution pixel, and the disc's radius in those pixels (Scheuermann 2004).
@@ -22,11 +23,11 @@ _LOW_RADIUS = 0.4
 
 def gather(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
-    taps: int | None = None,
+    max_coc: Number | None = None,
+    taps: WholeNumber | None = None,
     softness: Float[ArrayLike, ""] | float = 1.0,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by taps on the pixel's own circle of confusion, with a test of leaks.
@@ -45,7 +46,8 @@ def gather(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_coc`: static; the largest diameter, in pixels, to which larger ones are clamped, and
       that of a pixel whose b is 1. Outside `jit`, `grad` and `vmap` it may be left out.
@@ -54,10 +56,11 @@ def gather(
       paper's own step, `D_tap >= D_q`.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    spoils what reads it: 0.8 `max_coc` + 10 pixels away along each axis, at the most.
+    spoils what reads it: 0.8 `max_coc` + 10 pixels away along each axis, at the most. One whose
+    depth is missing is read by no other, and keeps its own colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
-    a negative `softness`, a bad `taps`, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
+    `softness`, a bad `taps`, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `softness` and every field of `lens`;
     zero where a circle is clamped. On the focus plane, where taps leave the pixel's centre, the
@@ -69,10 +72,10 @@ def gather(
     of 4 (its last row and column are repeated). Our own: the Vogel spiral, `softness`, and that
     the leak test reads the tap at full resolution, so that the centre always counts.
     """
-    image, depth, max_coc = check_arguments("gather", image, depth, lens, max_coc)
+    image, depth, lens, max_coc = check_arguments("gather", image, depth, lens, max_coc)
     softness = parameter("gather(softness=...)", softness)
     check("gather(softness=...)", softness, lambda v: v >= 0, "0 or positive")
-    disc = POISSON if taps is None else vogel(check_count("gather(taps=...)", taps))
+    disc = POISSON if taps is None else vogel(whole_number("gather(taps=...)", taps))
     disc = tuple(map(tuple, np.asarray(disc).tolist()))
     return _gather(image, depth, lens, softness, max_coc, disc)
 
@@ -84,9 +87,10 @@ def _gather(image, depth, lens, softness, max_coc, disc):
     softness = softness.astype(view.image.dtype)
     # What is bad is told by its colour, also in the low-resolution picture.
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
-    low = low_resolution(image)
-    # One read gives a tap's colour and its defocus.
-    full = jnp.concatenate([image, view.defocus[..., None]], axis=-1)
+    # One read gives a tap's colour, its defocus and how much of it has a depth.
+    planes = [image, view.defocus[..., None], jnp.ones_like(image[..., :1])]
+    full = jnp.where(view.missing[..., None], 0, jnp.concatenate(planes, axis=-1))
+    low = low_resolution(jnp.concatenate([full[..., :-2], full[..., -1:]], axis=-1))
     centre = view.defocus
     radius = absolute(centre)[..., None] / 2
     points = pixel_centers(image.shape[0], image.shape[1], image.dtype)
@@ -96,20 +100,31 @@ def _gather(image, depth, lens, softness, max_coc, disc):
     def add_tap(sums, offset):
         offset = offset[None, None] * radius
         high = bilinear(full, points + offset)
-        tap, defocus = high[..., :-1], high[..., -1]
+        known = high[..., -1]
+        mean = _mean(high)
+        tap, defocus = mean[..., :-1], mean[..., -1]
         blur = absolute(defocus) / max_coc
         soft = bilinear(low, points / _SIDE + _LOW_RADIUS * offset)
-        tap = mix(tap, soft, blur[..., None])
+        # Where the low-resolution picture knows nothing, the tap stands for itself.
+        share = jnp.where(soft[..., -1] > 0, blur, 0)
+        tap = mix(tap, _mean(soft), share[..., None])
         behind = (defocus >= centre - rounding).astype(image.dtype)
         ahead = (centre - defocus) / jnp.where(softness > 0, softness, 1)
         behind = jnp.where(softness > 0, clip01(1 - ahead), behind)
-        weight = (behind + (1 - behind) * blur)[..., None]
+        weight = (known * (behind + (1 - behind) * blur))[..., None]
         return (sums[0] + weight * tap, sums[1] + weight), None
 
     zero = jnp.zeros_like(image)
     offsets = jnp.asarray(disc, image.dtype)
-    (colors, weights), _ = jax.lax.scan(jax.checkpoint(add_tap), (zero, zero[..., :1]), offsets)
-    return (colors / weights).astype(dtype)
+    sums, _ = jax.lax.scan(jax.checkpoint(add_tap), (zero, zero[..., :1]), offsets)
+    sums = with_own(jnp.concatenate(sums, axis=-1), view.image, view.missing)
+    result = sums[..., :-1] / sums[..., -1:]
+    return jnp.where(view.lost[..., None], jnp.nan, result).astype(dtype)
+
+
+def _mean(sums: Float[Array, "height width value"]) -> Float[Array, "height width _"]:
+    """The sums over the last of them; 0 where that is 0."""
+    return sums[..., :-1] / jnp.where(sums[..., -1:] > 0, sums[..., -1:], 1)
 
 
 def mix(

@@ -1,19 +1,21 @@
 """Depth of field by scatter that knows what hides what, from one layer of depth or two."""
 
 import functools as ft
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._numerics import check, check_depth, check_image, clip01, parameter, sum_planes
-from jaxfx.dof._inputs import check_arguments, defocused
+from jaxfx._checks import Number, check, check_depth, check_image, items, parameter
+from jaxfx._numerics import clip01, sum_planes
+from jaxfx.dof._inputs import check_arguments, compiled, defocused, with_own
 from jaxfx.dof._sheets import composited
 from jaxfx.dof._slices import SLICES, Sheets
 from jaxfx.dof._spoiled import spoiled
 from jaxfx.dof._sprites import POINT_RADIUS, reach
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 _SMALLEST_GAP = 1e-3
@@ -25,11 +27,11 @@ _SEEN = 0.25
 
 def layered(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
-    behind: tuple[Float[ArrayLike, "height width channel"], Float[ArrayLike, "height width"]]
+    max_coc: Number | None = None,
+    behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
 ) -> Float[Array, "height width channel"]:
@@ -61,20 +63,23 @@ def layered(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from `depth`.
     - `behind`: the image and depth of the next surface that faces the camera behind the first,
-      shaped as `image` and `depth`; its depth is inf where there is none.
+      shaped as `image` and `depth`; its depth is inf where there is none, or as in `depth`
+      where it is missing.
     - `threshold`: pixels; how much the defocus changes from slice to slice. The default serves
       all scenes that we know. Below a 128th of `max_coc` it is that.
 
-    **Returns:** height width channel, in the type of `image`. A pixel whose colour or depth is
-    not a number spoils what its sprite can reach, `max_coc` where that is unknown.
+    **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
+    number spoils what its sprite can reach. One whose depth is missing has no sprite: it shows
+    what reaches it or, where nothing does, its own colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
-    a negative `threshold`, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
+    `threshold`, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
     every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
@@ -86,42 +91,56 @@ def layered(
     Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
     pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.
     """
-    image, depth, max_coc = check_arguments("layered", image, depth, lens, max_coc)
+    own = lens
+    image, depth, lens, max_coc = check_arguments("layered", image, depth, own, max_coc)
     threshold = parameter("layered(threshold=...)", threshold)
     check("layered(threshold=...)", threshold, lambda v: v >= 0, "0 or positive")
-    if behind is not None:
-        second = check_image("layered(behind=...)", behind[0])
-        if second.shape != image.shape:
-            raise ValueError(
-                f"`layered(behind=...)` must hold an image of shape {image.shape}, "
-                f"got {second.shape}."
-            )
-        name = "layered(behind=...)"
-        behind = second.astype(image.dtype), check_depth(name, behind[1], depth.shape)
-    return _layered(image, depth, lens, max_coc, behind, threshold)
+    second = None if behind is None else _second_layer(image, depth, own, behind)
+    return _layered(image, depth, lens, max_coc, second, threshold)
+
+
+def _second_layer(
+    image: Array, depth: Array, lens: Any, behind: Any
+) -> tuple[Array, Array, Any]:
+    """The second layer's image, its depth and the lens for it; `ValueError` names a fault."""
+    name = "layered(behind=...)"
+    pair = items(name, behind, "a pair of an image and its depth")
+    if len(pair) != 2:
+        raise ValueError(f"`{name}` must be an image and its depth, got {len(pair)} items.")
+    second = check_image(name, pair[0])
+    if second.shape != image.shape:
+        raise ValueError(
+            f"`{name}` must hold an image of shape {image.shape}, got {second.shape}."
+        )
+    farther = check_depth(name, pair[1], depth.shape)
+    return second.astype(image.dtype), farther, compiled("layered", lens, farther)
 
 
 @ft.partial(jax.jit, static_argnames=("max_coc",))
 def _layered(image, depth, lens, max_coc, behind, threshold):
     view = defocused(image, depth, lens, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
-    layers = [_sheet(view.image, view.defocus, jnp.ones_like(view.defocus), threshold)]
-    spoils = spoiled(view.bad, depth.astype(view.image.dtype), lens, max_coc)
+    through = jnp.where(view.missing, 0, jnp.ones_like(view.defocus))
+    layers = [_sheet(view.image, view.defocus, through, view.missing, threshold)]
+    spoils = spoiled(view.bad, jnp.abs(view.defocus), max_coc) | view.lost
     if behind is not None:
-        second = defocused(behind[0], behind[1], lens, max_coc)
-        there = jnp.isfinite(behind[1]) & ~second.bad
+        second = defocused(behind[0], behind[1], behind[2], max_coc)
+        # Behind what is not known it is not known what is seen.
+        there = jnp.isfinite(behind[1]) & ~(second.bad | second.missing | view.missing)
         farther = jnp.where(there, second.defocus, view.defocus)
-        seen = _seen(view.defocus, farther, max_coc)
+        # Nor does what is not known hide anything: it lies behind all.
+        seen = _seen(jnp.where(view.missing, max_coc, view.defocus), farther, max_coc)
         # What lies within a slice behind a surface is that surface, folded.
         apart = clip01((farther - view.defocus) / threshold - 1)
         through = jnp.where(there, clip01(seen / _SEEN) * apart, 0)
-        layers.append(_sheet(second.image, farther, through, threshold))
-        spoils |= spoiled(second.bad, behind[1].astype(view.image.dtype), lens, max_coc)
+        layers.append(_sheet(second.image, farther, through, view.missing, threshold))
+        spoils |= spoiled(second.bad, jnp.abs(second.defocus), max_coc)
     far = reach(max_coc)
     # Beyond the frame all goes on as it ends there.
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
     sheets = jax.tree.map(lambda *x: jnp.stack([pad(each) for each in x]), *layers)
     light, late = jnp.split(jnp.moveaxis(composited(far, sheets), 0, -1), 2, axis=-1)
+    late = with_own(late, view.image, view.missing)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
     return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)
 
@@ -130,13 +149,14 @@ def _sheet(
     image: Float[Array, "height width channel"],
     defocus: Float[Array, "height width"],
     through: Float[Array, "height width"],
+    missing: Bool[Array, "height width"],
     threshold: Float[Array, ""],
 ) -> Sheets:
     """The sprites of a layer."""
     half = jnp.abs(defocus) / 2
     radius = jnp.where(half < POINT_RADIUS, POINT_RADIUS, half)
     signed = jnp.where(defocus < 0, -2, 2) * radius
-    tilt = jnp.stack([_slope(defocus, 1), _slope(defocus, 0)]) / signed[None]
+    tilt = jnp.stack([_slope(defocus, missing, axis) for axis in (1, 0)]) / signed[None]
     # No weight turns negative within the disc.
     square, most = sum_planes(tilt * tilt), 1 / (radius + POINT_RADIUS)
     steep = square > most * most
@@ -146,20 +166,35 @@ def _sheet(
     return Sheets(jnp.moveaxis(value, -1, 0), radius, tilt, defocus / threshold)
 
 
-def _slope(x: Float[Array, "height width"], axis: int) -> Float[Array, "height width"]:
+def _slope(
+    x: Float[Array, "height width"], missing: Bool[Array, "height width"], axis: int
+) -> Float[Array, "height width"]:
     """How much a surface's defocus changes a pixel, an edge of it left aside.
 
     Of the differences to the neighbours on both sides, each weighted by the other's square: the
-    smaller counts where they differ much, and there is no kink where they are alike.
+    smaller counts where they differ much, and there is no kink where they are alike. A
+    neighbour that is missing stands back for the other.
     """
     if x.shape[axis] == 1:
         return jnp.zeros_like(x)
     step = jnp.diff(x, axis=axis)
+    size = x.shape[axis]
+    unknown = jax.lax.slice_in_dim(missing, 0, size - 1, axis=axis)
+    unknown |= jax.lax.slice_in_dim(missing, 1, size, axis=axis)
     first, last = (
         jax.lax.slice_in_dim(step, *ends, axis=axis) for ends in ((0, 1), (-1, None))
     )
     before = jnp.concatenate([first, step], axis=axis)
     after = jnp.concatenate([step, last], axis=axis)
+    first, last = (
+        jax.lax.slice_in_dim(unknown, *ends, axis=axis) for ends in ((0, 1), (-1, None))
+    )
+    no_before = jnp.concatenate([first, unknown], axis=axis)
+    no_after = jnp.concatenate([unknown, last], axis=axis)
+    before, after = (
+        jnp.where(no_before, jnp.where(no_after, 0, after), before),
+        jnp.where(no_after, jnp.where(no_before, 0, before), after),
+    )
     b, a = before * before + _LEVEL, after * after + _LEVEL
     return (a * before + b * after) / (a + b)
 

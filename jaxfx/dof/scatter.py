@@ -1,29 +1,22 @@
 """Depth of field by scattering every pixel over its circle of confusion."""
 
 import functools as ft
-import math
 from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._numerics import (
-    check,
-    check_depth,
-    check_image,
-    is_concrete,
-    parameter,
-    working_dtype,
-)
+from jaxfx._checks import Number, check, option, parameter
+from jaxfx.dof._inputs import check_arguments, largest_of, pixels, with_own
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof._spans import spans
 from jaxfx.dof._spoiled import spoiled
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.dof._tiles import farthest, shifts, tiles
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 Kernel = Literal["auto", "segment_sum", "shift", "tiles", "spans"]
@@ -44,12 +37,12 @@ _SMALLEST_EPSILON = 1e-6
 
 def scatter(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
     gamma: Float[ArrayLike, ""] | float = 0.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
-    max_coc: int | float | None = None,
+    max_coc: Number | None = None,
     kernel: Kernel = "auto",
     coverage: Coverage = "area",
 ) -> Float[Array, "height width channel"]:
@@ -66,7 +59,8 @@ def scatter(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `gamma`: amplification of the foreground, no unit; 0 is none. Amplification is limited
       to e**60.
@@ -82,11 +76,12 @@ def scatter(
     - `coverage`: `"area"`, the exact area of the disc in each row of pixels, or `"indicator"`,
       the paper's own, 1 where a pixel's centre lies inside (`"segment_sum"` only).
 
-    **Returns:** height width channel, in the type of `image`. A pixel whose colour or depth is
-    not a number spoils what its sprite can reach, `max_coc` where that is unknown, and no more.
+    **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
+    number spoils what its sprite can reach, and no more. One whose depth is missing has no
+    sprite: it shows what reaches it or, where nothing does, its own colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
-    a negative `gamma` or `epsilon`, an unknown option, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative `gamma` or
+    `epsilon`, an unknown option, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
     `lens`, silhouettes included, forward and reverse; again by `jax.jacfwd(jax.grad(loss))`,
@@ -102,76 +97,38 @@ def scatter(
     the split by which `"spans"` carry the leak rejection exactly (a source of 3 epsilon or more
     has the same factor `clamp(C_q / epsilon - 1)` from every pixel behind the focus).
     """
-    image = check_image("scatter(image)", image)
-    depth = check_depth("scatter(depth)", depth, image.shape[:2])
+    image, depth, lens, max_coc = check_arguments("scatter", image, depth, lens, max_coc)
     gamma = parameter("scatter(gamma=...)", gamma)
     epsilon = parameter("scatter(epsilon=...)", epsilon)
     check("scatter(gamma=...)", gamma, lambda v: v >= 0, "0 or positive")
     check("scatter(epsilon=...)", epsilon, lambda v: v >= 0, "0 or positive")
-    if kernel not in get_args(Kernel):
-        raise ValueError(
-            f"`scatter(kernel=...)` must be one of {get_args(Kernel)}, got {kernel!r}."
-        )
-    if coverage not in COVERAGES:
-        raise ValueError(
-            f"`scatter(coverage=...)` must be one of {tuple(COVERAGES)}, got {coverage!r}."
-        )
+    option("scatter(kernel=...)", kernel, get_args(Kernel))
+    option("scatter(coverage=...)", coverage, tuple(COVERAGES))
     if coverage == "indicator" and kernel != "segment_sum":
         raise ValueError(
             '`scatter(coverage="indicator")` must go with `kernel="segment_sum"`, '
             f"got {kernel!r}."
         )
-    max_coc = largest_coc("scatter", depth, lens) if max_coc is None else max_coc
-    if not (isinstance(max_coc, int | float) and 0 < max_coc < math.inf):
-        raise ValueError(f"`scatter(max_coc=...)` must be positive, got {max_coc}.")
     if kernel == "auto":
         # From the data where they can be looked at, else from what they may hold; the kernels
         # themselves go no farther, tile by tile, than what they do hold.
-        room = max_coc
-        if is_concrete(depth, lens):
-            room = min(room, _largest(depth, lens))
+        largest = largest_of("scatter", depth, lens)
+        room = max_coc if largest is None else min(max_coc, largest)
         height, width = depth.shape
         kernel = cheapest(height, width, room)
-    return _scatter(image, depth, lens, gamma, epsilon, float(max_coc), kernel, coverage)
-
-
-def largest_coc(
-    function: str, depth: Float[Array, "height width"], lens: ThinLens | FocusPlanes
-) -> float:
-    """The largest circle of confusion of concrete data, rounded up, in pixels.
-
-    Rounded to about eight steps an octave, so that near-by lenses share a compiled program.
-    """
-    if not is_concrete(depth, lens):
-        raise ValueError(
-            f"`{function}(max_coc=...)` must be given under `jit`, `grad` and `vmap`, where it "
-            "can't be taken from the data: a static diameter in pixels, got None."
-        )
-    largest = _largest(depth, lens)
-    if not math.isfinite(largest):
-        raise ValueError(
-            f"`{function}(max_coc=...)` must be given where a circle of confusion is not "
-            f"finite, got None and a largest circle of {largest}."
-        )
-    step = 2 ** max(0, math.floor(math.log2(max(largest, 1))) - 2) / 2
-    return max(1.0, math.ceil(largest / step) * step)
-
-
-def _largest(depth: Float[Array, "height width"], lens: ThinLens | FocusPlanes) -> float:
-    """The largest circle of concrete data that is a number, inside of another trace as well."""
-    with jax.ensure_compile_time_eval():
-        return float(jnp.nanmax(lens.circle_of_confusion(depth)))
+    return _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage)
 
 
 def to_sprites(
     image: Float[Array, "height width channel"],
     depth: Float[Array, "height width"],
-    lens: ThinLens | FocusPlanes,
+    lens: Lens,
     gamma: Float[Array, ""],
     epsilon: Float[Array, ""],
     max_coc: int | float,
+    missing: Bool[Array, "height width"],
 ) -> Sprites:
-    """The sprites of an image, in its type."""
+    """The sprites of an image, in its type; none where the depth is missing."""
     dtype = image.dtype
     coc = lens.circle_of_confusion(depth)
     coc = jnp.where(coc < max_coc, coc, max_coc)
@@ -187,23 +144,26 @@ def to_sprites(
     one = jnp.ones_like(image[..., :1])
     weight = visibility / (jnp.pi * radius * radius)
     value = jnp.concatenate([image, one], axis=-1) * weight[..., None]
+    value = jnp.where(missing[..., None], 0, value)
     epsilon = jnp.maximum(epsilon.astype(dtype), _SMALLEST_EPSILON)
-    return Sprites(value, radius, jnp.where(foreground, -1, coc), coc, epsilon)
+    leak = jnp.where(foreground, -1, coc)
+    # What leaks onto a pixel of unknown depth is not known: all of it is taken.
+    return Sprites(value, radius, leak, jnp.where(missing, max_coc, coc), epsilon)
 
 
-@ft.partial(jax.custom_jvp, nondiff_argnums=(5, 6, 7))
-def _in_or_out_of_focus(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
+@ft.partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8))
+def _in_or_out_of_focus(image, depth, lens, gamma, epsilon, missing, max_coc, kernel, coverage):
     """A picture wholly in focus is itself; its derivative is computed like any other."""
     blurred = ft.partial(_blurred, max_coc=max_coc, kernel=kernel, coverage=coverage)
 
     # A batch is worked through one by one: each of its pictures may be sharp or not.
     @sequential_vmap
-    def picture(image, depth, lens, gamma, epsilon):
+    def picture(image, depth, lens, gamma, epsilon, missing):
         sharp = (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
-        operands = image, depth, lens, gamma, epsilon
+        operands = image, depth, lens, gamma, epsilon, missing
         return jax.lax.cond(sharp, lambda image, *_: image, blurred, *operands)
 
-    return picture(image, depth, lens, gamma, epsilon)
+    return picture(image, depth, lens, gamma, epsilon, missing)
 
 
 @_in_or_out_of_focus.defjvp
@@ -212,17 +172,17 @@ def _in_or_out_of_focus_jvp(max_coc, kernel, coverage, primals, tangents):
     return jax.jvp(blurred, primals, tangents)
 
 
-def _blurred(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
+def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, kernel, coverage):
     """The quotient of the two sums, for finite pixels."""
     # Rematerialised: a reverse pass keeps the sprites, not the twenty planes they are made of.
     made = jax.checkpoint(to_sprites, static_argnums=5)
-    sprites = made(image, depth, lens, gamma, epsilon, max_coc)
+    sprites = made(image, depth, lens, gamma, epsilon, max_coc, missing)
     if kernel == "segment_sum":
         sums = segment_sum(sprites, reach(max_coc), coverage)
     else:
         kernels = {"shift": shifts, "tiles": tiles, "spans": spans}
         sums = kernels[kernel](sprites, reach(max_coc))
-    return _quotient(sums)
+    return _quotient(with_own(sums, image, missing))
 
 
 @jax.custom_jvp
@@ -261,16 +221,8 @@ def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
 
 @ft.partial(jax.jit, static_argnames=("max_coc", "kernel", "coverage"))
 def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
-    dtype = image.dtype
-    image = image.astype(working_dtype(dtype))
-    depth = depth.astype(image.dtype)
-
-    given, coc = depth, lens.circle_of_confusion(depth)
-    lost = jnp.isnan(coc) | (depth < 0)
-    wrong = lost | ~jnp.isfinite(image).all(axis=-1)
-    image = jnp.where(wrong[..., None], 0, image)
-    depth = jnp.where(lost, lens.focus_distance.astype(image.dtype), depth)
-
-    result = _in_or_out_of_focus(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage)
-    spoils = spoiled(wrong, given, lens, max_coc)
-    return jnp.where(spoils[..., None], jnp.nan, result).astype(dtype)
+    seen = pixels(image, depth, lens)
+    operands = seen.image, seen.depth, lens, gamma, epsilon, seen.missing
+    result = _in_or_out_of_focus(*operands, max_coc, kernel, coverage)
+    spoils = spoiled(seen.bad, lens.circle_of_confusion(seen.depth), max_coc) | seen.lost
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)

@@ -6,12 +6,13 @@ import math
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import absolute, check, parameter
-from jaxfx.dof._inputs import check_arguments, defocused
+from jaxfx._checks import Number, check, parameter
+from jaxfx._numerics import absolute
+from jaxfx.dof._inputs import OWN, check_arguments, defocused
 from jaxfx.dof._sprites import POINT_RADIUS, coverage, leak_rejection, reach
-from jaxfx.lens import FocusPlanes, ThinLens
+from jaxfx.lens import Lens
 
 
 # Half the side of a square over the diameter of the disc that has its variance.
@@ -24,10 +25,10 @@ _BAND = 16
 
 def separable(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
-    lens: ThinLens | FocusPlanes,
+    depth: Num[ArrayLike, "height width"],
+    lens: Lens,
     *,
-    max_coc: int | float | None = None,
+    max_coc: Number | None = None,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by two one-dimensional passes, along rows, then along columns.
@@ -47,17 +48,19 @@ def separable(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_coc`: static; the largest diameter, in pixels. Larger ones are clamped to it. Outside
       `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
     - `epsilon`: pixels; circles of confusion below it count as in focus.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
-    spoils the square about it, 0.44 `max_coc` + 1 to each side, and no more.
+    spoils the square about it, 0.44 `max_coc` + 1 to each side, and no more. One whose depth is
+    missing is not spread: it shows what reaches it or, where nothing does, its own colour.
 
-    **Raises:** `ValueError` for a wrong shape, an integer image, a depth that is not positive,
-    a negative `epsilon`, or no `max_coc` under a transform.
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative `epsilon`,
+    or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `epsilon` and every field of `lens`;
     zero where a circle is clamped.
@@ -66,7 +69,7 @@ def separable(
     adaptive filter in two passes, weighted by circles of confusion, that rejects leaks.
     Reconstructed: the weights, which are those of `scatter` on a line.
     """
-    image, depth, max_coc = check_arguments("separable", image, depth, lens, max_coc)
+    image, depth, lens, max_coc = check_arguments("separable", image, depth, lens, max_coc)
     epsilon = parameter("separable(epsilon=...)", epsilon)
     check("separable(epsilon=...)", epsilon, lambda v: v >= 0, "0 or positive")
     return _separable(image, depth, lens, epsilon, max_coc)
@@ -83,12 +86,15 @@ def _separable(image, depth, lens, epsilon, max_coc):
     far = reach(2 * _HALF_SIDE * max_coc)
 
     picture = jnp.moveaxis(jnp.where(view.bad[..., None], jnp.nan, view.image), -1, 0)
-    planes = picture, half, leak, coc
+    # What leaks onto a pixel of unknown depth is not known: all of it is taken.
+    coc = jnp.where(view.missing, max_coc, coc)
+    planes = picture, half, leak, coc, jnp.where(view.missing, 0, jnp.ones_like(coc))
     for _ in range(2):
         # Turned over after each pass: the second is along columns.
         picture = _in_bands(planes, epsilon, far)
         planes = tuple(plane.swapaxes(-1, -2) for plane in (picture, *planes[1:]))
-    return jnp.moveaxis(planes[0], 0, -1).astype(image.dtype)
+    result = jnp.moveaxis(planes[0], 0, -1)
+    return jnp.where(view.lost[..., None], jnp.nan, result).astype(image.dtype)
 
 
 def _in_bands(
@@ -105,8 +111,8 @@ def _in_bands(
         return jnp.moveaxis(plane.reshape(shape), -3, 0)
 
     def one(bands):
-        picture, half, leak, coc = bands
-        return _along_rows(picture, half, leak, coc, epsilon, far)
+        picture, half, leak, coc, known = bands
+        return _along_rows(picture, half, leak, coc, known, epsilon, far)
 
     passed = jax.lax.map(one, tuple(split(plane) for plane in planes))
     channels, width = planes[0].shape[0], planes[0].shape[-1]
@@ -118,30 +124,35 @@ def _along_rows(
     half: Float[Array, "height width"],
     leak: Float[Array, "height width"],
     coc: Float[Array, "height width"],
+    known: Float[Array, "height width"],
     epsilon: Float[Array, ""],
     far: int,
 ) -> Float[Array, "channel height width"]:
-    """One pass: the mean of the pixels of a row whose segments reach each of its pixels."""
+    """One pass: the mean of the pixels of a row whose segments reach each of its pixels.
+
+    Those that are not `known` have none, and a little weight for themselves.
+    """
     width = coc.shape[1]
 
     def pad(x, fill):
         return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(far, far)], constant_values=fill)
 
     padded = pad(image, 0), pad(half, POINT_RADIUS), pad(leak, -1)
-    inside = pad(jnp.ones_like(half), 0)
+    counts = pad(known, 0)
 
     def add_tap(sums, column):
         def seen(x):
             return jax.lax.dynamic_slice_in_dim(x, far - column, width, axis=-1)
 
         color, half, leak = map(seen, padded)
-        weight = seen(inside) * coverage(half, column) / (2 * half)
+        weight = seen(counts) * coverage(half, column) / (2 * half)
         weight = weight * leak_rejection(leak, coc, epsilon)
         # What has no share is not looked at: it may be no number.
         part = weight[None] * jnp.where(weight[None] == 0, 0, color)
         return (sums[0] + part, sums[1] + weight), None
 
-    start = jnp.zeros_like(image), jnp.zeros_like(coc)
+    own = jnp.where(known == 0, OWN, jnp.zeros_like(coc))
+    start = jnp.where(known[None] == 0, OWN * image, 0), own
     offsets = jnp.arange(-far, far + 1)
     (sums, weights), _ = jax.lax.scan(jax.checkpoint(add_tap), start, offsets)
     return sums / weights[None]

@@ -8,11 +8,14 @@ from typing import Any, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._numerics import check_image, safe_divide
+from jaxfx._arguments import check_camera
+from jaxfx._checks import Number, WholeNumber, check, check_image, whole_number
+from jaxfx._numerics import safe_divide
 from jaxfx._progress import Bar
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
@@ -54,13 +57,13 @@ class CameraFit(eqx.Module):
 def camera(
     reference: Float[ArrayLike, "rows columns channel"],
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
+    depth: Num[ArrayLike, "height width"],
     source: PinholeCamera,
     start: PinholeCamera,
     *,
-    hole_threshold: int | float = 0.1,
+    hole_threshold: Number = 0.1,
     solver: Solver | None = None,
-    max_steps: int = 32,
+    max_steps: WholeNumber = 32,
     throw: bool = True,
     progress: bool = False,
 ) -> CameraFit:
@@ -111,11 +114,13 @@ def camera(
     1994, the exponential of a twist; the masks and the last blur are our own.
     """
     reference, image, depth = _pictures(reference, image, depth)
-    _check(source, start, max_steps)
+    max_steps = _check(source, start, max_steps)
     check_options("camera", reference.shape[:2], "pyramid", hole_threshold)
     with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
-        model, end = _search(reference, image, depth, source, start, hole_threshold, descend_on)
+        model, end = _search(
+            reference, image, depth, source, start, float(hole_threshold), descend_on
+        )
     columns, residual, share = _report(model, end.unknowns)
     if throw and (end.result != optx.RESULTS.successful or share == 0):
         raise RuntimeError(
@@ -163,16 +168,11 @@ def _search(
     return sharpest, end._replace(losses=losses + end.losses)
 
 
-def _check(source: Any, start: Any, max_steps: Any) -> None:
+def _check(source: Any, start: Any, max_steps: Any) -> int:
+    """The number of steps; `ValueError` names a camera or a number that is none."""
     for name, eye in (("source", source), ("start", start)):
-        if not isinstance(eye, PinholeCamera):
-            raise ValueError(
-                f"`camera({name})` must be a PinholeCamera, got {type(eye).__name__}."
-            )
-    if not isinstance(max_steps, int) or max_steps < 1:
-        raise ValueError(
-            f"`camera(max_steps=...)` must be a positive integer, got {max_steps}."
-        )
+        check_camera(f"camera({name})", eye, PinholeCamera)
+    return whole_number("camera(max_steps=...)", max_steps)
 
 
 def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Array]:
@@ -186,10 +186,8 @@ def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Arr
             f"got {reference.shape[2]}."
         )
     for name, value in (("image", image), ("reference", reference)):
-        if not bool(jnp.isfinite(value).all()):
-            raise ValueError(f"`camera({name})` must be finite, got a NaN or inf pixel.")
-    if not bool((jnp.isfinite(depth) & (depth > 0)).any()):
-        raise ValueError("`camera(depth)` must be known somewhere, got no finite positive.")
+        check(f"camera({name})", value, np.isfinite, "finite")
+    check("camera(depth)", depth, lambda v: (np.isfinite(v) & (v > 0)).any(), "known somewhere")
     return reference.astype(image.dtype), image, depth.astype(image.dtype)
 
 

@@ -9,15 +9,28 @@ from typing import Any, Literal, final, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import check, check_depth, check_image, parameter
+from jaxfx._arguments import check_lens
+from jaxfx._checks import (
+    Number,
+    WholeNumber,
+    check,
+    check_depth,
+    check_image,
+    number,
+    option,
+    parameter,
+    whole_number,
+)
 from jaxfx._progress import Bar
+from jaxfx.dof._inputs import largest_coc
 from jaxfx.dof._sprites import POINT_RADIUS
 from jaxfx.dof.layered import layered
-from jaxfx.dof.scatter import largest_coc, scatter
+from jaxfx.dof.scatter import scatter
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
 from jaxfx.lens import ThinLens
 
@@ -73,19 +86,19 @@ class DofFit(eqx.Module):
 def dof(
     reference: Float[ArrayLike, "height width channel"],
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
+    depth: Num[ArrayLike, "height width"],
     lens: ThinLens,
     *,
     gamma: Float[ArrayLike, ""] | float = 1.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
     method: Method = "scatter",
     threshold: Float[ArrayLike, ""] | float = 2.0,
-    behind: tuple[Float[ArrayLike, "height width channel"], Float[ArrayLike, "height width"]]
+    behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
-    max_coc: int | float | None = None,
+    max_coc: Number | None = None,
     solver: Solver | None = None,
     parameters: Collection[str] | None = None,
-    max_steps: int = 64,
+    max_steps: WholeNumber = 64,
     throw: bool = True,
     progress: bool = False,
 ) -> DofFit:
@@ -125,14 +138,12 @@ def dof(
     **Gradient:** none through the search: it stops at every step to report.
     """
     reference, image, depth = _pictures(reference, image, depth)
-    if method not in get_args(Method):
-        raise ValueError(
-            f"`dof(method=...)` must be one of {get_args(Method)}, got {method!r}."
-        )
+    option("dof(method=...)", method, get_args(Method))
     start = _start(lens, gamma, epsilon, threshold, image.dtype)
     unknowns = {name: _unconstrain(name, start[name]) for name in _names(method, parameters)}
-    if not isinstance(max_steps, int) or max_steps < 1:
-        raise ValueError(f"`dof(max_steps=...)` must be a positive integer, got {max_steps}.")
+    max_steps = whole_number("dof(max_steps=...)", max_steps)
+    if max_coc is not None:
+        max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
     _check_moves(unknowns, lens, depth, behind, max_coc)
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
     with Bar(progress, "fit") as bar:
@@ -175,8 +186,8 @@ def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Arr
             f"got {reference.shape}."
         )
     for name, value in (("image", image), ("reference", reference)):
-        if not bool(jnp.isfinite(value).all()):
-            raise ValueError(f"`dof({name})` must be finite, got a NaN or inf pixel.")
+        check(f"dof({name})", value, np.isfinite, "finite")
+    check("dof(depth)", depth, lambda v: (v > 0).any(), "known somewhere")
     return reference.astype(image.dtype), image, depth
 
 
@@ -184,6 +195,7 @@ def _start(lens: Any, gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
     """All parameters where the search starts, checked, in one type."""
     if not isinstance(lens, ThinLens):
         raise ValueError(f"`dof(lens)` must be a ThinLens, got {type(lens).__name__}.")
+    check_lens("dof(lens)", lens)
     check("dof(lens.aperture)", lens.aperture, lambda v: v > 0, "positive to start a search")
     start = {
         "aperture": lens.aperture,
@@ -271,7 +283,8 @@ class _Model(eqx.Module):
     def clamped(self, values: _Unknowns) -> Float[Array, ""]:
         """The share of pixels whose circles it can't draw in full."""
         assert self.max_coc is not None
-        return jnp.mean(self.lens(values).circle_of_confusion(self.depth) > self.max_coc)
+        circles = self.lens(values).circle_of_confusion(self.depth)
+        return jnp.mean((circles > self.max_coc) & (self.depth > 0))
 
 
 def _search(

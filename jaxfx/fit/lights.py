@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Collection, Sequence
-from typing import Any, final, get_args
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -12,7 +12,8 @@ import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check_image, parameter
+from jaxfx._arguments import check_camera, check_gbuffer, check_lights
+from jaxfx._checks import WholeNumber, check, check_image, items, share, whole_number
 from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors, verdict
@@ -78,10 +79,10 @@ def lights(
     lights: Sequence[Light],
     *,
     visibility: Any = None,
-    rounds: int = 1,
+    rounds: WholeNumber = 1,
     solver: Solver | None = None,
     parameters: Collection[str] = LIGHT_PARAMETERS,
-    max_steps: int = 64,
+    max_steps: WholeNumber = 64,
     throw: bool = True,
     progress: bool = False,
 ) -> LightsFit:
@@ -94,9 +95,8 @@ def lights(
     negative one says that the model does not fit.
 
     The search is local. Started too far away it may end in another minimum. What changes
-    nothing to begin with has no derivative to move it: the place of a light that lights
-    nothing, or one known by a shadow alone that falls nowhere. It stays as it is, and the log
-    says so.
+    nothing to begin with, the place of a light that lights nothing say, has no derivative to
+    move it: it stays, and the log says so.
 
     **Arguments:**
 
@@ -128,12 +128,13 @@ def lights(
     Source: the elimination of the linear unknowns is Golub & Pereyra 1973; that the colours of
     lights are a linear problem, Schoeneman et al. 1993.
     """
+    gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
+    check_camera("lights(camera)", camera)
     reference = _reference(reference, gbuffer)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
-    for name, value in (("rounds", rounds), ("max_steps", max_steps)):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"`lights({name}=...)` must be a positive integer, got {value}.")
+    rounds = whole_number("lights(rounds=...)", rounds)
+    max_steps = whole_number("lights(max_steps=...)", max_steps)
     with Bar(progress, "fit") as bar:
         model, end = _search_in_rounds(
             rounds,
@@ -166,28 +167,21 @@ def lights(
 def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
     """The picture, checked, in the type of the cache."""
     reference = check_image("lights(reference)", reference)
-    if not isinstance(gbuffer, GBuffer):
-        kind = type(gbuffer).__name__
-        raise ValueError(f"`lights(gbuffer)` must be a GBuffer, got {kind}.")
     if reference.shape != gbuffer.color.shape:
         raise ValueError(
             f"`lights(reference)` must have the cache's shape {gbuffer.color.shape}, "
             f"got {reference.shape}."
         )
-    if not bool(jnp.isfinite(reference).all()):
-        raise ValueError("`lights(reference)` must be finite, got a NaN or inf pixel.")
+    check("lights(reference)", reference, np.isfinite, "finite")
     return reference.astype(gbuffer.color.dtype)
 
 
 def _start(lights: Any) -> tuple[Light, ...]:
     """The lights, checked, in JAX's default type: that is the type of the solvers' numbers."""
-    if not isinstance(lights, Sequence) or not lights:
-        raise ValueError(f"`lights(lights)` must be a sequence of lights, got {lights!r}.")
-    for index, light in enumerate(lights):
-        if not isinstance(light, Light):
-            kinds, kind = ", ".join(k.__name__ for k in get_args(Light)), type(light).__name__
-            raise ValueError(f"`lights(lights[{index}])` must be one of {kinds}, got {kind}.")
-    return jax.tree.map(lambda leaf: leaf.astype(float), tuple(lights))
+    lights = check_lights("lights(lights)", lights)
+    if not lights:
+        raise ValueError("`lights(lights)` must be a sequence of lights, got none.")
+    return jax.tree.map(lambda leaf: leaf.astype(float), lights)
 
 
 def _names(parameters: Collection[str], lights: tuple[Light, ...]) -> tuple[str, ...]:
@@ -202,16 +196,16 @@ def _names(parameters: Collection[str], lights: tuple[Light, ...]) -> tuple[str,
 
 def _entries(visibility: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
     """The entries of `visibility`, checked."""
-    entries = (None,) * count if visibility is None else tuple(visibility)
+    name = "lights(visibility=...)"
+    given = [None] * count if visibility is None else visibility
+    entries = items(name, given, "a sequence of entries, or a function")
     if len(entries) != count:
         raise ValueError(
             f"`lights(visibility=...)` must have an entry for each of {count} lights, "
             f"got {len(entries)}."
         )
-    name = "lights(visibility=...)"
     return tuple(
-        each if each is None or callable(each) else parameter(name, each, shape)
-        for each in entries
+        each if each is None or callable(each) else share(name, each, shape) for each in entries
     )
 
 

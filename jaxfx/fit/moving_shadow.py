@@ -6,9 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxfx._numerics import check, clip01, parameter
+from jaxfx._arguments import check_camera, check_gbuffer, check_light
+from jaxfx._checks import WholeNumber, check, check_map, parameter, whole_number
+from jaxfx._numerics import clip01
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
@@ -62,24 +64,21 @@ class MovingShadow(eqx.Module):
 
     def __init__(
         self,
-        shadow_map: Float[ArrayLike, "rows columns"],
+        shadow_map: Num[ArrayLike, "rows columns"],
         light_camera: PinholeCamera | OrthographicCamera,
         gbuffer: GBuffer,
         camera: PinholeCamera | OrthographicCamera,
         *,
         softness: Any,
-        size: int = 9,
+        size: WholeNumber = 9,
     ):
-        shadow_map = jnp.asarray(shadow_map)
-        if shadow_map.ndim != 2 or not jnp.issubdtype(shadow_map.dtype, jnp.floating):
-            raise ValueError(
-                "`MovingShadow(shadow_map)` must hold floats of shape (rows, columns), "
-                f"got {shadow_map.dtype} of shape {shadow_map.shape}."
-            )
-        if isinstance(size, bool) or not isinstance(size, int) or size < 3 or size % 2 == 0:
-            raise ValueError(
-                f"`MovingShadow(size=...)` must be an odd number of texels from 3, got {size}."
-            )
+        shadow_map = check_map("MovingShadow(shadow_map)", shadow_map)
+        check_camera("MovingShadow(light_camera)", light_camera)
+        gbuffer = check_gbuffer("MovingShadow(gbuffer)", gbuffer)
+        check_camera("MovingShadow(camera)", camera)
+        is_odd = lambda n: n >= 3 and n % 2 == 1
+        name = "MovingShadow(size=...)"
+        size = whole_number(name, size, is_odd, "an odd number of texels from 3")
         softness = parameter("MovingShadow(softness=...)", softness)
         check("MovingShadow(softness=...)", softness, lambda v: v > 0, "positive")
         self.occluders, self.known = _points(light_camera, shadow_map.astype(float))
@@ -105,6 +104,7 @@ class MovingShadow(eqx.Module):
                 "`MovingShadow(light)` must be directional for an orthographic shadow map and "
                 f"a point or spot light for a pinhole's, got {type(light).__name__}."
             )
+        check_light("MovingShadow(light)", light)
         return _visibility(self, light)
 
 

@@ -3,11 +3,13 @@
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from jaxfx._checks import as_numpy
 from jaxfx._files import StrPath, write_whole
 from jaxfx.io._pixels import png_values
 
@@ -19,13 +21,16 @@ def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*
 
     **Returns:** the same type and shape, not clipped: outside [0, 1] the curve goes on.
 
+    **Raises:** `ValueError` for integers.
+
     **Gradient:** none; the host side.
 
     Source: IEC 61966-2-1, the piecewise curve.
     """
-    linear = np.asarray(linear)
-    power = np.maximum(linear, 0.0031308) ** (1 / 2.4)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * power - 0.055)
+    values, dtype = _floats("srgb_from_linear(linear)", linear)
+    power = np.maximum(values, 0.0031308) ** (1 / 2.4)
+    curve = np.where(values <= 0.0031308, 12.92 * values, 1.055 * power - 0.055)
+    return curve.astype(dtype)
 
 
 def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -35,13 +40,27 @@ def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*sh
 
     **Returns:** linear light, the same type and shape, not clipped.
 
+    **Raises:** `ValueError` for integers: 8-bit numbers are to be divided by 255 first.
+
     **Gradient:** none; the host side.
 
     Source: IEC 61966-2-1, the piecewise curve.
     """
-    srgb = np.asarray(srgb)
-    power = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
-    return np.where(srgb <= 0.04045, srgb / 12.92, power)
+    values, dtype = _floats("linear_from_srgb(srgb)", srgb)
+    power = ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4
+    curve = np.where(values <= 0.04045, values / 12.92, power)
+    return curve.astype(dtype)
+
+
+def _floats(name: str, values: Any) -> tuple[np.ndarray, np.dtype]:
+    """Numbers to compute a curve of, in float32 at least, and their own type."""
+    array = as_numpy(name, values)
+    if array.dtype.kind in "biu":
+        raise ValueError(
+            f"`{name}` must hold floats, 1 for the largest, got {array.dtype}. Divide 8-bit "
+            "numbers by 255 and 16-bit ones by 65535."
+        )
+    return array.astype(np.result_type(array.dtype, np.float32)), array.dtype
 
 
 def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) -> None:

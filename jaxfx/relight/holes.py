@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int
 
+from jaxfx._arguments import check_gbuffer
+from jaxfx._checks import as_array
 from jaxfx.gbuffer import GBuffer
 
 
@@ -28,7 +30,8 @@ def fill_holes(
     Source: Kim, Lee & Kyung leave the holes' filling open; the nearest pixel is found as by
     Saito & Toriwaki 1994, columns first.
     """
-    coverage = jnp.asarray(coverage)
+    gbuffer = check_gbuffer("fill_holes(gbuffer)", gbuffer)
+    coverage = as_array("fill_holes(coverage)", coverage)
     if coverage.shape != gbuffer.depth.shape:
         raise ValueError(
             f"`fill_holes(coverage)` must have the cache's height and width "
@@ -40,7 +43,7 @@ def fill_holes(
 @jax.jit
 def _fill(gbuffer, coverage):
     covered = coverage > 0
-    hole = ~covered & jnp.isfinite(gbuffer.depth)
+    hole = ~covered & jnp.isfinite(gbuffer.depth) & (gbuffer.depth > 0)
     found, near = _nearest(covered, hole)
     hole &= found
     height, width = covered.shape

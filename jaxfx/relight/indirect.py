@@ -1,16 +1,18 @@
 """Light that comes by way of another surface, for the cost of a matrix product."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import parameter, working_dtype
+from jaxfx._arguments import check_gbuffer, check_lights
+from jaxfx._checks import shares
+from jaxfx._numerics import working_dtype
 from jaxfx.gbuffer import GBuffer, Transfer
 from jaxfx.light import AmbientLight, Light
-from jaxfx.relight.shading import Surface, checked, received
+from jaxfx.relight.shading import Surface, check_shader, received
 
 
 def indirect(
@@ -18,7 +20,7 @@ def indirect(
     transfer: Transfer,
     lights: Sequence[Light],
     *,
-    lit: Sequence[Float[ArrayLike, " point"] | None] | None = None,
+    lit: Sequence[Any] | None = None,
 ) -> Float[Array, "height width 3"]:
     """The picture of what diffuse surfaces send on to one another, once: add it to `render`'s.
 
@@ -35,9 +37,9 @@ def indirect(
     - `transfer`: from `scene.transfer`, of this cache.
     - `lights`: a sequence of lights of any kinds. Ambient ones stand for indirect light
       themselves, and bring nothing here.
-    - `lit`: for each light, a number in [0, 1] for each point, how much of the light gets
-      there, or None for all of it. `scene.visible(mesh, transfer.position, light.position)`
-      tells. None alone stands for no shadows at all.
+    - `lit`: for each light, a number in [0, 1] or a boolean for each point, how much of the
+      light gets there, or None for all of it. `scene.visible(mesh, transfer.position,
+      light.position)` tells. None alone stands for no shadows at all.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`; 0 where the
     shader is -1.
@@ -49,29 +51,20 @@ def indirect(
 
     Source: Hasan, Pellacini & Bala 2006, equation 3.
     """
-    if not isinstance(lights, Sequence):
-        kind = type(lights).__name__
-        raise ValueError(f"`indirect(lights)` must be a sequence of lights, got {kind}.")
-    named = {f"indirect(lights[{index}])": light for index, light in enumerate(lights)}
-    gbuffer = checked(gbuffer, named)
+    lights = check_lights("indirect(lights)", lights)
+    gbuffer = check_shader(check_gbuffer("indirect(gbuffer)", gbuffer))
+    if not isinstance(transfer, Transfer):
+        kind = type(transfer).__name__
+        raise ValueError(f"`indirect(transfer)` must be a Transfer, got {kind}.")
+    transfer = Transfer(*jax.tree.leaves(transfer))
     shape = transfer.receive.shape[:2]
     if shape != gbuffer.depth.shape:
         raise ValueError(
             f"`indirect(transfer)` must be of the cache's height and width "
             f"{gbuffer.depth.shape}, got {shape}."
         )
-    lit = [None] * len(lights) if lit is None else lit
-    if len(lit) != len(lights):
-        raise ValueError(
-            f"`indirect(lit=...)` must hold numbers or None for each of {len(lights)} lights, "
-            f"got {len(lit)}."
-        )
-    points = (len(transfer.position),)
-    lit = [
-        each if each is None else parameter(f"indirect(lit=...)[{i}]", each, points)
-        for i, each in enumerate(lit)
-    ]
-    return _indirect(gbuffer, transfer, tuple(lights), lit)
+    lit = shares("indirect(lit=...)", lit, len(lights), (len(transfer.position),))
+    return _indirect(gbuffer, transfer, lights, lit)
 
 
 @jax.jit
@@ -80,10 +73,10 @@ def _indirect(gbuffer, transfer, lights, lit):
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     surface = _points(transfer)
     arriving = jnp.zeros_like(transfer.diffuse)
-    for light, share in zip(lights, lit, strict=True):
+    for light, part in zip(lights, lit, strict=True):
         if not isinstance(light, AmbientLight):
             brought = received(surface, light)[0][0]
-            arriving += brought if share is None else share.astype(dtype)[:, None] * brought
+            arriving += brought if part is None else part.astype(dtype)[:, None] * brought
     sent = transfer.send @ (transfer.diffuse * arriving)
     image = gbuffer.diffuse.astype(dtype) * (transfer.receive @ sent)
     image = jnp.where((gbuffer.shader < 0)[..., None], 0, image)

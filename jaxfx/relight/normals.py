@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check_image, normalize
+from jaxfx._checks import check_image
+from jaxfx._numerics import normalize
 from jaxfx.light import DirectionalLight
 
 

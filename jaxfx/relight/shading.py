@@ -14,9 +14,11 @@ from typing import Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import check, clip01, normalize, parameter, safe_divide, working_dtype
+from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
+from jaxfx._checks import check, share, shares
+from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
@@ -36,7 +38,9 @@ def shade(
     gbuffer: GBuffer,
     camera: PinholeCamera | OrthographicCamera,
     light: Light,
-    visibility: Float[ArrayLike, "height width"] | None = None,
+    visibility: Float[ArrayLike, "height width"]
+    | Bool[ArrayLike, "height width"]
+    | None = None,
 ) -> Float[Array, "height width 3"]:
     """The picture under one light.
 
@@ -55,14 +59,16 @@ def shade(
 
     - `gbuffer`, `camera`: the cache, height width, and the camera that it was made with.
     - `light`: any of the four.
-    - `visibility`: height width, in [0, 1]; multiplies the result. All 1 if left out.
+    - `visibility`: height width, in [0, 1] or booleans; multiplies the result. All 1 if left
+      out.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`. Exactly 0 where the
     shader is -1 or the depth inf. A NaN in one pixel stays there. A roughness below 1e-4 counts
     as 1e-4, and a light nearer to the surface than 1e-5 scene units fades out.
 
-    **Raises:** `ValueError` for a wrong shape, an unknown light or an unknown shader. A traced
-    shader can't be looked at: any but 0, 1 and 2 is black.
+    **Raises:** `ValueError` for a wrong shape, an unknown light or shader, or a visibility
+    outside [0, 1]. Traced values can't be looked at: any shader but 0, 1 and 2 is black, and a
+    visibility multiplies as it is.
 
     **Gradient:** exact, forward and reverse, with respect to the light, the camera,
     `visibility` and every float image of the cache but `color`, which is not read. At N.L = 0,
@@ -72,9 +78,10 @@ def shade(
     Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting;
     the models are those of Phong 1975 and Blinn 1977.
     """
-    gbuffer = checked(gbuffer, {"shade(light)": light})
+    gbuffer = checked("shade", gbuffer, camera)
+    check_light("shade(light)", light)
     if visibility is not None:
-        visibility = parameter("shade(visibility)", visibility, gbuffer.depth.shape)
+        visibility = share("shade(visibility)", visibility, gbuffer.depth.shape)
     return _shade(gbuffer, camera, light, visibility)
 
 
@@ -83,7 +90,7 @@ def render(
     camera: PinholeCamera | OrthographicCamera,
     lights: Sequence[Light],
     *,
-    visibilities: Sequence[Float[ArrayLike, "height width"] | None] | None = None,
+    visibilities: Sequence[Any] | None = None,
 ) -> Float[Array, "height width 3"]:
     """The image under several lights and their shadows: the sum of `shade` over them.
 
@@ -103,13 +110,11 @@ def render(
 
     Source: as `shade`'s.
     """
-    if not isinstance(lights, Sequence):
-        kind = type(lights).__name__
-        raise ValueError(f"`render(lights)` must be a sequence of lights, got {kind}.")
-    named = {f"render(lights[{index}])": light for index, light in enumerate(lights)}
-    gbuffer = checked(gbuffer, named)
-    visibilities = checked_visibilities("render", visibilities, len(lights), gbuffer)
-    return _render(gbuffer, camera, tuple(lights), visibilities)
+    lights = check_lights("render(lights)", lights)
+    gbuffer = checked("render", gbuffer, camera)
+    name, shape = "render(visibilities=...)", gbuffer.depth.shape
+    visible = tuple(shares(name, visibilities, len(lights), shape))
+    return _render(gbuffer, camera, lights, visible)
 
 
 class Surface(NamedTuple):
@@ -155,6 +160,7 @@ def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> 
 
 def exponent(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
     """The power that a highlight's cosine is raised to."""
+    roughness = jnp.where(roughness > 1, 1, roughness)
     return 2 / jnp.maximum(roughness**2, _SMOOTHEST**2) - 2
 
 
@@ -198,7 +204,8 @@ def _cone(light: SpotLight, to_light: _Vectors) -> _Scalars:
     inner = 2 * jnp.sin(light.inner_angle / 2) ** 2
     outer = 2 * jnp.sin(light.outer_angle / 2) ** 2
     angle = _one_minus_cosine(-normalize(light.direction)[None, None], to_light)
-    step = clip01(safe_divide(outer - angle, outer - inner))
+    # No light where the angles are out of order.
+    step = clip01(safe_divide(outer - angle, jnp.maximum(outer - inner, 0)))
     return step * step * (3 - 2 * step)
 
 
@@ -233,30 +240,16 @@ def _unit(vector: _Vectors) -> _Vectors:
     return vector / jnp.sqrt(_squared_length(vector))
 
 
-def checked(gbuffer: GBuffer, lights: dict[str, Any]) -> GBuffer:
-    """The cache, built again to check its shapes: it may have been edited as a pytree."""
-    for name, light in lights.items():
-        if not isinstance(light, Light):
-            kinds = ", ".join(kind.__name__ for kind in get_args(Light))
-            raise ValueError(f"`{name}` must be one of {kinds}, got {type(light).__name__}.")
-    gbuffer = GBuffer(*jax.tree.leaves(gbuffer))
+def checked(function: str, gbuffer: Any, camera: Any) -> GBuffer:
+    """The cache of a camera, built again to check its shapes: both may have been edited."""
+    check_camera(f"{function}(camera)", camera)
+    return check_shader(check_gbuffer(f"{function}(gbuffer)", gbuffer))
+
+
+def check_shader(gbuffer: GBuffer) -> GBuffer:
+    """The cache; `ValueError` where a shader is known and none of ours."""
     check("GBuffer(shader)", gbuffer.shader, lambda v: (v >= -1) & (v <= 2), "-1, 0, 1 or 2")
     return gbuffer
-
-
-def checked_visibilities(
-    function: str, visibilities: Any, count: int, gbuffer: GBuffer
-) -> tuple[_Scalars | None, ...]:
-    """An image or None for each of `count` lights; `ValueError` names a wrong one."""
-    name = f"{function}(visibilities=...)"
-    entries = (None,) * count if visibilities is None else tuple(visibilities)
-    if len(entries) != count:
-        raise ValueError(
-            f"`{name}` must hold an image or None for each of {count} lights, "
-            f"got {len(entries)}."
-        )
-    shape = gbuffer.depth.shape
-    return tuple(each if each is None else parameter(name, each, shape) for each in entries)
 
 
 def stacked(

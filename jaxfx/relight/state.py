@@ -5,9 +5,8 @@ and one for the specular. A change of light takes out what the old one brought a
 new; a change of reflectance touches no light at all.
 """
 
-import operator
 from collections.abc import Sequence
-from typing import Any, Literal, final, get_args
+from typing import Any, Literal, final
 
 import equinox as eqx
 import jax
@@ -15,18 +14,14 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import parameter, safe_divide
+from jaxfx._arguments import check_light, check_lights
+from jaxfx._checks import as_array, parameter, share, shares, whole_number
+from jaxfx._numerics import safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight._sums import Sums, changed, image as shaded, nothing
-from jaxfx.relight.shading import (
-    Surface,
-    checked,
-    checked_visibilities,
-    exponent,
-    to_surface,
-)
+from jaxfx.relight.shading import Surface, checked, exponent, to_surface
 
 
 _Image = Float[Array, "height width 3"]
@@ -38,7 +33,7 @@ def start(
     camera: PinholeCamera | OrthographicCamera,
     lights: Sequence[Light],
     *,
-    visibilities: Sequence[Float[ArrayLike, "height width"] | None] | None = None,
+    visibilities: Sequence[Any] | None = None,
 ) -> "RelightState":
     """Shade every light once, and keep what an edit of one of them needs.
 
@@ -58,9 +53,10 @@ def start(
     Source: Pellacini et al. 2005 (Lpics), who keep the sum of the lights that are not edited.
     The two sums and their compensation (Knuth 1969, 4.2.2, theorem B) are our own.
     """
-    lights = _check_lights(lights)
-    gbuffer = checked(gbuffer, {f"start(lights[{i}])": light for i, light in enumerate(lights)})
-    visibilities = checked_visibilities("start", visibilities, len(lights), gbuffer)
+    lights = check_lights("start(lights)", lights)
+    gbuffer = checked("start", gbuffer, camera)
+    name, shape = "start(visibilities=...)", gbuffer.depth.shape
+    visibilities = shares(name, visibilities, len(lights), shape)
     surface = jax.jit(to_surface)(gbuffer, camera)
     empty = RelightState(
         color=gbuffer.color.astype(surface.position.dtype),
@@ -113,7 +109,10 @@ class RelightState(eqx.Module):
         self,
         i: int,
         light: Light,
-        visibility: Float[ArrayLike, "height width"] | Literal["kept"] | None = "kept",
+        visibility: Float[ArrayLike, "height width"]
+        | Bool[ArrayLike, "height width"]
+        | Literal["kept"]
+        | None = "kept",
     ) -> "RelightState":
         """The state with another light in place of light `i`.
 
@@ -149,7 +148,11 @@ class RelightState(eqx.Module):
         return _changed(self, both, (-1.0, 1.0), lights, visible)
 
     def add(
-        self, light: Light, visibility: Float[ArrayLike, "height width"] | None = None
+        self,
+        light: Light,
+        visibility: Float[ArrayLike, "height width"]
+        | Bool[ArrayLike, "height width"]
+        | None = None,
     ) -> "RelightState":
         """The state with one light more, the last.
 
@@ -214,12 +217,15 @@ class RelightState(eqx.Module):
 
         **Gradient:** exact with respect to every new value.
         """
-        if jnp.shape(mask) != self.color.shape[:2]:
+        where = as_array("paint(mask)", mask)
+        if where.shape != self.color.shape[:2]:
             raise ValueError(
                 f"`paint(mask)` must have the cache's height and width "
-                f"{self.color.shape[:2]}, got {jnp.shape(mask)}."
+                f"{self.color.shape[:2]}, got {where.shape}."
             )
-        where, state, surface = jnp.asarray(mask)[..., None], self, self.surface
+        if where.dtype != jnp.bool_:
+            raise ValueError(f"`paint(mask)` must hold booleans, got {where.dtype}.")
+        where, state, surface = where[..., None], self, self.surface
         if color is not None:
             new = jnp.where(where, _vector(self, "color", color), self.color)
             ratio = safe_divide(new, self.color)
@@ -242,7 +248,7 @@ class RelightState(eqx.Module):
         state = eqx.tree_at(lambda s: s.surface, state, surface)
         if roughness is None:
             return state
-        value = parameter("paint(roughness=...)", roughness).astype(self.color.dtype)
+        value = share("paint(roughness=...)", roughness, ()).astype(self.color.dtype)
         sharper = jnp.where(where[..., 0], exponent(value), surface.exponent)
         surface = surface._replace(exponent=sharper)
         bare = eqx.tree_at(
@@ -253,14 +259,6 @@ class RelightState(eqx.Module):
         return _with_all(bare, self.lights, self.visibilities)
 
 
-def _check_lights(lights: Any) -> tuple[Any, ...]:
-    # Checked one by one by `checked`: a type checker at run time would meet some before it.
-    if not isinstance(lights, Sequence):
-        kind = type(lights).__name__
-        raise ValueError(f"`start(lights)` must be a sequence of lights, got {kind}.")
-    return tuple(lights)
-
-
 # Functions, for a call of a method costs equinox a look at every light.
 
 
@@ -269,13 +267,9 @@ def _vector(state: RelightState, name: str, value: Any) -> Float[Array, "1 1 3"]
 
 
 def _index(state: RelightState, method: str, i: Any) -> int:
-    try:
-        index = operator.index(i)
-    except TypeError:
-        raise ValueError(f"`{method}(i)` must be a static integer, got {i!r}.") from None
-    if not 0 <= index < len(state.lights):
-        raise ValueError(f"`{method}(i)` must be in [0, {len(state.lights)}), got {index}.")
-    return index
+    count = len(state.lights)
+    index = whole_number(f"{method}(i)", i, lambda n: True, "a static integer")
+    return whole_number(f"{method}(i)", index, lambda n: 0 <= n < count, f"in [0, {count})")
 
 
 def _check(
@@ -284,15 +278,10 @@ def _check(
     """Lights and visibilities in the type of the sums."""
     dtype, shape = state.color.dtype, state.color.shape[:2]
     for light in lights:
-        if not isinstance(light, Light):
-            kinds = ", ".join(kind.__name__ for kind in get_args(Light))
-            kind = type(light).__name__
-            raise ValueError(f"`{method}(light)` must be one of {kinds}, got {kind}.")
+        check_light(f"{method}(light)", light)
     cast = lambda leaf: leaf.astype(dtype)
     images = (
-        None
-        if image is None
-        else parameter(f"{method}(visibility)", image, shape).astype(dtype)
+        None if image is None else share(f"{method}(visibility)", image, shape).astype(dtype)
         for image in visibility
     )
     return tuple(jax.tree.map(cast, tuple(lights))), tuple(images)

@@ -16,11 +16,22 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int, Num
 
-from jaxfx._numerics import check_depth, normalize, safe_divide
+from jaxfx._arguments import check_camera, check_gbuffer
+from jaxfx._checks import (
+    Number,
+    WholeNumber,
+    check_depth,
+    check_map,
+    items,
+    number,
+    option,
+    whole_number,
+)
+from jaxfx._numerics import normalize, safe_divide
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.relight._views import Found, Scalars, look_up, points
 
@@ -34,9 +45,9 @@ def synthesize(
     cameras: Sequence[PinholeCamera | OrthographicCamera],
     target: PinholeCamera | OrthographicCamera,
     *,
-    depth: Float[ArrayLike, "height width"],
-    tolerance: float = 0.005,
-    angle: float = 0.5,
+    depth: Num[ArrayLike, "height width"],
+    tolerance: Number = 0.005,
+    angle: Number = 0.5,
     weights: Literal["equal", "detail"] = "equal",
 ) -> tuple[GBuffer, Int[Array, "height width"]]:
     """The cache of the camera `target`, and how many caches each of its pixels comes from.
@@ -51,8 +62,9 @@ def synthesize(
 
     - `gbuffers`, `cameras`: the caches, height width each, of any sizes, and their cameras.
     - `target`: the new camera.
-    - `depth`: height width, of the new view, scene units along its axis, inf for background:
-      from the mesh, or from the caches' own depths, warped.
+    - `depth`: height width, of the new view, scene units along its axis, inf for background; 0,
+      negative or NaN where it is missing: from the mesh, or from the caches' own depths,
+      warped.
     - `tolerance`: static; of the depth. It must cover the error of the depths.
     - `angle`: static; radians.
     - `weights`: "equal" is the source's mean; "detail" favours the nearer and more frontal
@@ -73,13 +85,11 @@ def synthesize(
     Source: Kim, Lee & Kyung, equations 2 and 3. The tests across the surface, of normal and of
     shader, and the weights, are our own.
     """
-    _check("synthesize", gbuffers, cameras)
-    if not tolerance > 0:
-        raise ValueError(f"`synthesize(tolerance=...)` must be positive, got {tolerance}.")
-    if not angle > 0:
-        raise ValueError(f"`synthesize(angle=...)` must be positive, got {angle} radians.")
+    caches = _check("synthesize", gbuffers, cameras, target)
+    tolerance = number("synthesize(tolerance=...)", tolerance)
+    angle = number("synthesize(angle=...)", angle, expected="positive, in radians,")
+    option("synthesize(weights=...)", weights, ("equal", "detail"))
     depth = _check_target("synthesize", depth)
-    caches = tuple(gbuffers), tuple(cameras)
     options = {"tolerance": tolerance, "angle": angle, "weights": weights}
     return _synthesize(*caches, target, depth, **options)
 
@@ -89,10 +99,10 @@ def best_caches(
     cameras: Sequence[PinholeCamera | OrthographicCamera],
     target: PinholeCamera | OrthographicCamera,
     *,
-    depth: Float[ArrayLike, "height width"],
-    count: int,
-    tolerance: float = 0.005,
-    stride: int = 8,
+    depth: Num[ArrayLike, "height width"],
+    count: WholeNumber,
+    tolerance: Number = 0.005,
+    stride: WholeNumber = 8,
 ) -> Int[Array, " count"]:
     """Which caches serve a new view best: the one that sees most of it, and so on.
 
@@ -114,15 +124,13 @@ def best_caches(
     Source: our own; the greedy choice is within 1 - 1/e of the best (Nemhauser, Wolsey &
     Fisher 1978).
     """
-    _check("best_caches", gbuffers, cameras)
-    if not 1 <= count <= len(gbuffers):
-        raise ValueError(
-            f"`best_caches(count=...)` must be in [1, {len(gbuffers)}], got {count}."
-        )
-    if stride < 1:
-        raise ValueError(f"`best_caches(stride=...)` must be at least 1, got {stride}.")
+    caches = _check("best_caches", gbuffers, cameras, target)
+    most = len(caches[0])
+    in_range = lambda n: 1 <= n <= most
+    count = whole_number("best_caches(count=...)", count, in_range, f"in [1, {most}]")
+    stride = whole_number("best_caches(stride=...)", stride, expected="at least 1")
+    tolerance = number("best_caches(tolerance=...)", tolerance)
     depth = _check_target("best_caches", depth)
-    caches = tuple(gbuffers), tuple(cameras)
     options = {"count": count, "tolerance": tolerance, "stride": stride}
     return _best_caches(*caches, target, depth, **options)
 
@@ -150,26 +158,33 @@ def _best_caches(gbuffers, cameras, target, depth, *, count, tolerance, stride):
     return jnp.stack(chosen)
 
 
-def _check(caller: str, gbuffers: Any, cameras: Any) -> None:
+def _check(
+    caller: str, gbuffers: Any, cameras: Any, target: Any
+) -> tuple[tuple[GBuffer, ...], tuple[Camera, ...]]:
+    gbuffers = items(f"{caller}(gbuffers)", gbuffers)
+    cameras = items(f"{caller}(cameras)", cameras)
     for name, values in (("gbuffers", gbuffers), ("cameras", cameras)):
-        if not isinstance(values, Sequence) or not values:
+        if not values:
             raise ValueError(
-                f"`{caller}({name})` must be a sequence of at least one, got {values!r:.40}."
+                f"`{caller}({name})` must be a sequence of at least one, got none."
             )
+    gbuffers = [
+        check_gbuffer(f"{caller}(gbuffers[{i}])", each) for i, each in enumerate(gbuffers)
+    ]
+    for index, camera in enumerate(cameras):
+        check_camera(f"{caller}(cameras[{index}])", camera)
+    check_camera(f"{caller}(target)", target)
     if len(gbuffers) != len(cameras):
         raise ValueError(
             f"`{caller}(cameras)` must be one for each cache, got {len(cameras)} for "
             f"{len(gbuffers)}."
         )
+    return tuple(gbuffers), tuple(cameras)
 
 
 def _check_target(caller: str, depth: Any) -> Scalars:
-    shape = jnp.shape(depth)
-    if len(shape) != 2 or 0 in shape:
-        raise ValueError(
-            f"`{caller}(depth=...)` must have shape (height, width), neither 0, got {shape}."
-        )
-    return check_depth(f"{caller}(depth=...)", depth, shape)
+    depth = check_map(f"{caller}(depth=...)", depth)
+    return check_depth(f"{caller}(depth=...)", depth, depth.shape)
 
 
 @partial(jax.jit, static_argnames=("tolerance", "angle", "weights"))

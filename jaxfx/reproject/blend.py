@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._numerics import check_image, normalize, safe_divide, sum_planes, working_dtype
+from jaxfx._checks import Number, WholeNumber, check_image, items, whole_number
+from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.reproject._rays import Camera
@@ -36,13 +37,13 @@ class Choice(NamedTuple):
 
 def blend(
     images: Sequence[Float[ArrayLike, "height width channel"]],
-    depths: Sequence[Float[ArrayLike, "height width"]],
+    depths: Sequence[Num[ArrayLike, "height width"]],
     sources: Sequence[PinholeCamera],
     target: Camera,
     *,
     shape: tuple[int, int] | None = None,
     method: Method = "pyramid",
-    hole_threshold: int | float = 0.1,
+    hole_threshold: Number = 0.1,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     """A picture from another camera out of several: each `warp`ed, the nearer surface first.
 
@@ -72,7 +73,7 @@ def blend(
     images = [check_image("blend(images)", image) for image in images]
     size = check_options("blend", shape or images[0].shape[:2], method, hole_threshold)
     depths = _checked("blend", depths, [image.shape[:2] for image in images], sources, target)
-    options = {"method": method, "hole_threshold": hole_threshold}
+    options = {"method": method, "hole_threshold": float(hole_threshold)}
     seen = Sight(target, pixel_centers(*size).reshape(-1, 2), options)
     return _blended(seen, images, depths, list(sources), size)
 
@@ -99,13 +100,13 @@ def _blended(
 
 
 def choose(
-    depths: Sequence[Float[ArrayLike, "height width"]],
+    depths: Sequence[Num[ArrayLike, "height width"]],
     sources: Sequence[PinholeCamera],
     target: Camera,
     *,
-    count: int,
+    count: WholeNumber,
     shape: tuple[int, int] | None = None,
-    hole_threshold: int | float = 0.1,
+    hole_threshold: Number = 0.1,
 ) -> Choice:
     """The few sources that together show most of a target.
 
@@ -133,16 +134,15 @@ def choose(
     Source: Nemhauser, Wolsey & Fisher 1978, the greedy choice's bound; the worth is our own.
     """
     _check_lists("choose", depths=depths, sources=sources)
-    if not isinstance(count, int) or not 1 <= count <= len(sources):
-        raise ValueError(
-            f"`choose(count=...)` must be an integer from 1 to {len(sources)}, got {count}."
-        )
+    most = len(sources)
+    is_valid = lambda n: 1 <= n <= most
+    count = whole_number("choose(count=...)", count, is_valid, f"an integer from 1 to {most}")
     size = shape or jnp.shape(depths[0])[:2]
     height, width = check_options("choose", size, "pyramid", hole_threshold)
     rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in (height, width))
     pixels = pixel_centers(height, width)[rows, columns].reshape(-1, 2)
     depths = _checked("choose", depths, list(map(jnp.shape, depths)), sources, target)
-    options = {"method": "pyramid", "hole_threshold": hole_threshold}
+    options = {"method": "pyramid", "hole_threshold": float(hole_threshold)}
     return _chosen(Sight(target, pixels, options), depths, list(sources), count)
 
 
@@ -164,8 +164,12 @@ def _chosen(seen: "Sight", depths: list, sources: list, count: int) -> Choice:
     return Choice(jnp.stack(chosen), jnp.stack(reached))
 
 
-def _check_lists(caller: str, **lists: Sequence) -> None:
-    lengths = {name: len(items) for name, items in lists.items()}
+def _check_lists(caller: str, **lists: Any) -> None:
+    expected = "a sequence with an item for each source"
+    lengths = {
+        name: len(items(f"{caller}({name})", values, expected))
+        for name, values in lists.items()
+    }
     if len(set(lengths.values())) > 1 or 0 in lengths.values():
         name = next(iter(lists))
         raise ValueError(

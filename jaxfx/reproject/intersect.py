@@ -1,12 +1,13 @@
 """The first crossing of rays with a depth map."""
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxfx._checks import WholeNumber, option, parameter, whole_number
 from jaxfx._numerics import working_dtype
 from jaxfx.reproject._search import search
 from jaxfx.reproject._surface import bilinear_point, texel_point
@@ -36,12 +37,12 @@ class Hit(NamedTuple):
 
 
 def intersect(
-    depth: Float[ArrayLike, "height width"],
+    depth: Num[ArrayLike, "height width"],
     origin: Float[ArrayLike, "*ray 3"],
     direction: Float[ArrayLike, "*ray 3"],
     *,
     method: Method = "pyramid",
-    max_steps: int | None = None,
+    max_steps: WholeNumber | None = None,
     surface: Literal["texel", "bilinear"] = "texel",
 ) -> Hit:
     """The first crossing of each ray with a depth map.
@@ -83,11 +84,15 @@ def intersect(
     & Oh ("descent"); Musgrave 1991, grid tracing; Brawley & Tatarchuk 2004 ("linear");
     Policarpo, Oliveira & Comba 2005 ("relief"). The exits of "pyramid" are our own.
     """
-    depth, origin, direction = map(jnp.asarray, (depth, origin, direction))
+    depth, origin, direction = (
+        parameter(f"intersect({name})", value, None)
+        for name, value in (("depth", depth), ("origin", origin), ("direction", direction))
+    )
     _check(depth, origin, direction, method, max_steps, surface)
     dtype = working_dtype(depth.dtype, origin.dtype, direction.dtype)
     depth, origin, direction = (x.astype(dtype) for x in (depth, origin, direction))
-    return _intersect(depth, origin, direction, method, max_steps, surface)
+    steps = None if max_steps is None else int(max_steps)
+    return _intersect(depth, origin, direction, method, steps, surface)
 
 
 @eqx.filter_jit
@@ -122,19 +127,12 @@ def _check(depth, origin, direction, method, max_steps, surface) -> None:
             f"got {direction.shape}."
         )
     check_method("intersect", method)
-    if surface not in ("texel", "bilinear"):
-        raise ValueError(
-            f'`intersect(surface=...)` must be "texel" or "bilinear", got {surface!r}.'
-        )
-    if max_steps is not None and (not isinstance(max_steps, int) or max_steps < 1):
-        raise ValueError(
-            f"`intersect(max_steps=...)` must be a positive integer or None, got {max_steps}."
-        )
+    option("intersect(surface=...)", surface, ("texel", "bilinear"))
+    if max_steps is not None:
+        name, expected = "intersect(max_steps=...)", "a positive integer or None"
+        whole_number(name, max_steps, expected=expected)
 
 
 def check_method(caller: str, method: str) -> None:
     """Raise `ValueError` for a method that is none of the four."""
-    if method not in Method.__args__:
-        raise ValueError(
-            f"`{caller}(method=...)` must be one of {Method.__args__}, got {method!r}."
-        )
+    option(f"{caller}(method=...)", method, get_args(Method))

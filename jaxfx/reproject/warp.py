@@ -3,11 +3,12 @@
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import check_image, working_dtype
+from jaxfx._arguments import check_camera
+from jaxfx._checks import Number, check_image, items, number, parameter, whole_number
+from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.reproject._rays import Camera
@@ -18,13 +19,13 @@ from jaxfx.reproject.intersect import Method, check_method
 
 def warp(
     image: Float[ArrayLike, "height width channel"],
-    depth: Float[ArrayLike, "height width"],
+    depth: Num[ArrayLike, "height width"],
     source: PinholeCamera,
     target: Camera,
     *,
     shape: tuple[int, int] | None = None,
     method: Method = "pyramid",
-    hole_threshold: int | float = 0.1,
+    hole_threshold: Number = 0.1,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     """A picture with depth, from another camera: what it shows, and where it shows something.
 
@@ -69,7 +70,7 @@ def warp(
     depth = check_source("warp", depth, image.shape[:2])
     check_cameras("warp", source, target)
     shape = check_options("warp", shape or image.shape[:2], method, hole_threshold)
-    return _drawn(image, depth, source, target, shape, method, hole_threshold)
+    return _drawn(image, depth, source, target, shape, method, float(hole_threshold))
 
 
 @eqx.filter_jit
@@ -92,30 +93,19 @@ def _drawn(
 
 def check_source(caller: str, depth: ArrayLike, shape: tuple[int, ...]) -> Array:
     """`depth` as a float array of `shape`, whatever it holds; `ValueError` otherwise."""
-    array = jnp.asarray(depth)
+    array = parameter(f"{caller}(depth)", depth, None)
     if array.shape != shape or max(shape) > LARGEST:
         raise ValueError(
             f"`{caller}(depth)` must have the image's height and width {shape}, each at most "
             f"{LARGEST}, got {array.shape}."
-        )
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        raise ValueError(
-            f"`{caller}(depth)` must hold floats (scene units), got {array.dtype}."
         )
     return array
 
 
 def check_cameras(caller: str, source: Any, target: Any) -> None:
     """Raise `ValueError` for cameras of a kind that is not served."""
-    if not isinstance(source, PinholeCamera):
-        raise ValueError(
-            f"`{caller}(source)` must be a PinholeCamera, got {type(source).__name__}."
-        )
-    if not isinstance(target, Camera):
-        raise ValueError(
-            f"`{caller}(target)` must be a PinholeCamera or an OrthographicCamera, "
-            f"got {type(target).__name__}."
-        )
+    check_camera(f"{caller}(source)", source, PinholeCamera)
+    check_camera(f"{caller}(target)", target)
 
 
 def check_options(
@@ -123,12 +113,10 @@ def check_options(
 ) -> tuple[int, int]:
     """The shape, checked, and `ValueError` for an option out of range."""
     check_method(caller, method)
-    if not isinstance(hole_threshold, int | float) or not hole_threshold > 0:
-        raise ValueError(
-            f"`{caller}(hole_threshold=...)` must be a positive number, got {hole_threshold}."
-        )
-    if len(shape) != 2 or not all(isinstance(n, int) and n > 0 for n in shape):
-        raise ValueError(
-            f"`{caller}(shape=...)` must be a height and a width in pixels, got {shape}."
-        )
-    return shape[0], shape[1]
+    number(f"{caller}(hole_threshold=...)", hole_threshold, expected="a positive number")
+    name, expected = f"{caller}(shape=...)", "a height and a width in pixels"
+    sides = items(name, shape, expected)
+    if len(sides) != 2:
+        raise ValueError(f"`{name}` must be {expected}, got {shape}.")
+    height, width = (whole_number(name, side, expected=expected) for side in sides)
+    return height, width

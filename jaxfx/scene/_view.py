@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxfx._numerics import is_concrete
+from jaxfx._checks import is_concrete
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.light import AmbientLight, DirectionalLight

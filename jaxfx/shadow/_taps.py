@@ -10,9 +10,11 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import absolute, check, parameter, working_dtype
+from jaxfx._checks import check, check_map, option, parameter, whole_number
+from jaxfx._numerics import absolute, working_dtype
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -59,30 +61,24 @@ def checked(
     and the slope bias 1. `middle` is for a filter that compares the mean of its texels' depths:
     how many texels its middle may lie from a receiver, along an axis.
     """
-    shadow_map = jnp.asarray(shadow_map)
-    if shadow_map.ndim != 2 or 0 in shadow_map.shape:
+    shadow_map = check_map(f"{function}(shadow_map)", shadow_map)
+    if not isinstance(receivers, Receivers):
+        kind = type(receivers).__name__
         raise ValueError(
-            f"`{function}(shadow_map)` must have shape (height, width), neither of them 0, "
-            f"got {shadow_map.shape}. Batches are made with `jax.vmap`."
+            f"`{function}(receivers)` must be what `receivers` gave, got a {kind}."
         )
-    fields = [jnp.asarray(field) for field in receivers]
+    fields = [
+        parameter(f"{function}(receivers.{name})", field, None)
+        for name, field in zip(Receivers._fields, receivers, strict=True)
+    ]
     for name, field in zip(Receivers._fields, fields, strict=True):
         if field.shape != fields[0].shape or field.ndim != 2 or 0 in field.shape:
             raise ValueError(
                 f"`{function}(receivers)` must hold images of one shape (height, width), "
                 f"got {field.shape} for `{name}`."
             )
-    for name, field in (("shadow_map", shadow_map), ("receivers", fields[0])):
-        if not jnp.issubdtype(field.dtype, jnp.floating):
-            raise ValueError(f"`{function}({name})` must hold floats, got {field.dtype}.")
-    if isinstance(size, bool) or not isinstance(size, int) or size < 1 or size % 2 == 0:
-        raise ValueError(
-            f"`{function}(size=...)` must be an odd number of texels from 1, got {size!r}."
-        )
-    if kernel not in get_args(Kernel):
-        raise ValueError(
-            f"`{function}(kernel=...)` must be one of {get_args(Kernel)}, got {kernel!r}."
-        )
+    size = check_size(f"{function}(size=...)", size)
+    option(f"{function}(kernel=...)", kernel, get_args(Kernel))
     if softness is not None:
         softness = parameter(f"{function}(softness=...)", softness)
         check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
@@ -95,6 +91,8 @@ def checked(
     bias, slope_bias = (0.0 if each is None else each for each in (bias, slope_bias))
     bias = parameter(f"{function}(bias=...)", bias)
     slope_bias = parameter(f"{function}(slope_bias=...)", slope_bias)
+    for name, number in (("bias", bias), ("slope_bias", slope_bias)):
+        check(f"{function}({name}=...)", number, np.isfinite, "finite")
     return shadow_map, receivers, bias, slope_bias, softness
 
 
@@ -112,6 +110,12 @@ def _needed_bias(map_dtype, reach, terms, receivers, softness):
     rounding = sum(float(jnp.finfo(each).eps) for each in types) + _SPARE_DEPTH
     needed = (reach + _SPARE_TEXELS) * slope + rounding * z
     return needed if softness is None else needed + half_width(softness, dtype)
+
+
+def check_size(name: str, size: Any, least: int = 1) -> int:
+    """The width of a filter, odd, in texels; `ValueError` otherwise."""
+    is_odd = lambda n: n >= least and n % 2 == 1
+    return whole_number(name, size, is_odd, f"an odd number of texels from {least}")
 
 
 def without_gradient(kernel: Kernel, data: tuple[Any, ...]) -> Any:

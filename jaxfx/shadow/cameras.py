@@ -3,12 +3,15 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import check, normalize, parameter
+from jaxfx._arguments import check_light
+from jaxfx._checks import WholeNumber, check, parameter, whole_number
+from jaxfx._numerics import normalize
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
+from jaxfx.light import AmbientLight, DirectionalLight, Light, SpotLight
 
 
 # The two world axes that a map's rows and columns follow on each face of a cube.
@@ -25,10 +28,10 @@ _FACES = (
 def light_cameras(
     light: Light,
     *,
-    map_size: int,
+    map_size: WholeNumber,
     centre: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
     radius: Float[ArrayLike, ""] | float = 1.0,
-    margin: int = 0,
+    margin: WholeNumber = 0,
 ) -> tuple[PinholeCamera | OrthographicCamera, ...]:
     """The cameras that a light's shadow maps are made with.
 
@@ -60,14 +63,18 @@ def light_cameras(
 
     Source: Williams 1978; the cube is that of Greene 1986's environment maps.
     """
-    if not 0 <= 2 * margin < map_size:
-        raise ValueError(
-            f"`light_cameras(margin=...)` must be 0 or more and below half of `map_size`, "
-            f"got {margin} of {map_size}."
-        )
+    check_light("light_cameras(light)", light)
+    map_size = whole_number("light_cameras(map_size=...)", map_size)
+    margin = whole_number(
+        "light_cameras(margin=...)",
+        margin,
+        lambda n: 0 <= 2 * n < map_size,
+        f"0 or more and below half of `map_size`, which is {map_size}",
+    )
     centre = parameter("light_cameras(centre=...)", centre, (3,))
     radius = parameter("light_cameras(radius=...)", radius)
-    check("light_cameras(radius=...)", radius, lambda v: v > 0, "positive")
+    check("light_cameras(centre=...)", centre, np.isfinite, "finite")
+    check("light_cameras(radius=...)", radius, lambda v: (v > 0) & (v < np.inf), "positive")
     inner = map_size - 2 * margin
     if isinstance(light, AmbientLight):
         return ()
@@ -85,9 +92,6 @@ def light_cameras(
         )
         pose = _pose(light.position, normalize(light.direction))
         return (_pinhole(jnp.tan(light.outer_angle), inner, map_size, pose),)
-    if not isinstance(light, PointLight):
-        kind = type(light).__name__
-        raise ValueError(f"`light_cameras(light)` must be one of the four lights, got {kind}.")
     one = jnp.ones_like(light.position[0])
     poses = [
         _pose(light.position, *(jnp.asarray(each, one.dtype) for each in f)) for f in _FACES

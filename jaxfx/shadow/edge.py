@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, Num, UInt32
 
-from jaxfx._numerics import is_concrete
+from jaxfx._checks import WholeNumber, is_concrete, option, whole_number
 from jaxfx.shadow import _taps
 from jaxfx.shadow._masked import find_mask, masked
 from jaxfx.shadow._taps import Kernel
@@ -35,16 +35,16 @@ class Candidates(NamedTuple):
 
 
 def edge_pcf(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
     kernel: Kernel = "box",
     mask: Mask = "depth",
-    dilation: int | None = None,
+    dilation: WholeNumber | None = None,
 ) -> Float[Array, "height width"]:
     """Percentage-closer filtering near the edges of shadows alone: O(I + B * size**2).
 
@@ -81,20 +81,21 @@ def edge_pcf(
     """
     data = (shadow_map, receivers, bias, slope_bias, softness)
     data = _taps.checked("edge_pcf", *data, size=size, kernel=kernel)
+    size = int(size)
     dilation = _reach("edge_pcf", mask, dilation, size, data)
     return _edge_pcf(size, kernel, mask, dilation, *_taps.without_gradient(kernel, data))
 
 
 def candidates(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
     mask: Mask = "depth",
-    dilation: int | None = None,
+    dilation: WholeNumber | None = None,
 ) -> Candidates:
     """The pixels that `edge_pcf` filters, and the number of comparisons that it makes.
 
@@ -112,6 +113,7 @@ def candidates(
     """
     data = (shadow_map, receivers, bias, slope_bias, softness)
     data = _taps.checked("candidates", *data, size=size)
+    size = int(size)
     where = _candidates(size, mask, _reach("candidates", mask, dilation, size, data), *data)
     tests = where.size * (2 if mask == "depth" else 1)
     taps = jnp.sum(where, dtype=jnp.uint32) * size**2
@@ -120,8 +122,7 @@ def candidates(
 
 def _reach(name: str, mask: Any, dilation: Any, size: int, data: Any) -> int:
     """The dilation, checked; found if it is left out; 0 where there is none."""
-    if mask not in get_args(Mask):
-        raise ValueError(f"`{name}(mask=...)` must be one of {get_args(Mask)}, got {mask!r}.")
+    option(f"{name}(mask=...)", mask, get_args(Mask))
     if mask == "depth":
         if dilation is not None:
             raise ValueError(
@@ -136,9 +137,7 @@ def _reach(name: str, mask: Any, dilation: Any, size: int, data: Any) -> int:
                 "it can't be taken from the receivers: static, in pixels, got None."
             )
         dilation = usual_dilation(*data[:4], size=size)
-    if isinstance(dilation, bool) or not isinstance(dilation, int) or dilation < 1:
-        raise ValueError(f"`{name}(dilation=...)` must be 1 or more pixels, got {dilation!r}.")
-    return dilation
+    return whole_number(f"{name}(dilation=...)", dilation, expected="1 or more pixels")
 
 
 def usual_dilation(

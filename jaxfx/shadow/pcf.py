@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Num
 
+from jaxfx._checks import WholeNumber
 from jaxfx._filter import apart
 from jaxfx.shadow import _taps
 from jaxfx.shadow._taps import Kernel, Places
@@ -21,7 +22,7 @@ _LEAST_WINDOW = 7
 
 
 def hard(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
     bias: Float[ArrayLike, ""] | float | None = None,
@@ -57,10 +58,10 @@ def hard(
 
 
 def prefiltered(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
@@ -86,6 +87,7 @@ def prefiltered(
     """
     data = (shadow_map, receivers, bias, slope_bias)
     data = _taps.checked("prefiltered", *data, size=size, middle=0.5)
+    size = int(size)
     return jax.lax.stop_gradient(_prefiltered(*data[:4], size))
 
 
@@ -103,10 +105,10 @@ def _prefiltered(shadow_map, receivers, bias, slope_bias, size):
 
 
 def pcf(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
@@ -145,7 +147,7 @@ def pcf(
     """
     data = (shadow_map, receivers, bias, slope_bias, softness)
     data = _taps.checked("pcf", *data, size=size, kernel=kernel)
-    return filtered(*_taps.without_gradient(kernel, data), size, kernel)
+    return filtered(*_taps.without_gradient(kernel, data), int(size), kernel)
 
 
 @ft.partial(jax.jit, static_argnames=("size", "kernel"))

@@ -6,9 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import absolute, check, clip01, parameter, safe_divide
+from jaxfx._arguments import check_camera
+from jaxfx._checks import WholeNumber, check, parameter
+from jaxfx._numerics import absolute, clip01, safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.shadow import _taps
 from jaxfx.shadow.pcf import read
@@ -16,11 +18,11 @@ from jaxfx.shadow.receivers import Receivers
 
 
 def pcss(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     light_camera: PinholeCamera | OrthographicCamera,
     *,
-    size: int,
+    size: WholeNumber,
     light_size: Float[ArrayLike, ""] | float,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
@@ -56,9 +58,10 @@ def pcss(
     """
     data = (shadow_map, receivers, bias, slope_bias, softness)
     shadow_map, receivers, *rest = _taps.checked("pcss", *data, size=size)
+    check_camera("pcss(light_camera)", light_camera)
     light_size = parameter("pcss(light_size=...)", light_size)
     check("pcss(light_size=...)", light_size, lambda v: v > 0, "positive")
-    return _pcss(shadow_map, receivers, light_camera, *rest, light_size, size)
+    return _pcss(shadow_map, receivers, light_camera, *rest, light_size, int(size))
 
 
 @ft.partial(jax.jit, static_argnames=("size",))

@@ -5,22 +5,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._numerics import (
-    absolute,
-    normalize,
-    parameter,
-    safe_divide,
-    safe_sqrt,
-    working_dtype,
-)
+from jaxfx._arguments import check_camera
+from jaxfx._checks import check, check_map, items, parameter
+from jaxfx._numerics import absolute, normalize, safe_divide, safe_sqrt, working_dtype
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
 
 
-_Camera = PinholeCamera | OrthographicCamera
 _Image = Float[Array, "height width"]
 _Vectors = Float[Array, "height width 3"]
 
@@ -44,7 +39,7 @@ class Receivers(NamedTuple):
 
 
 def receivers(
-    depth: Float[ArrayLike, "height width"],
+    depth: Num[ArrayLike, "height width"],
     camera: PinholeCamera | OrthographicCamera,
     light_camera: PinholeCamera
     | OrthographicCamera
@@ -79,15 +74,13 @@ def receivers(
     Source: Williams 1978, section 3; the offset is Holbert 2011's, the slope what is now known
     as slope-scaled bias.
     """
-    depth = jnp.asarray(depth)
-    if depth.ndim != 2 or 0 in depth.shape:
-        raise ValueError(
-            "`receivers(depth)` must have shape (height, width), neither of them 0, "
-            f"got {depth.shape}. Batches are made with `jax.vmap`."
-        )
-    if not jnp.issubdtype(depth.dtype, jnp.floating):
-        raise ValueError(f"`receivers(depth)` must hold floats, got {depth.dtype}.")
-    cameras = (light_camera,) if isinstance(light_camera, _Camera) else tuple(light_camera)
+    depth = check_map("receivers(depth)", depth)
+    check_camera("receivers(camera)", camera)
+    name, cameras = "receivers(light_camera)", (light_camera,)
+    if not isinstance(light_camera, Camera):
+        cameras = tuple(items(name, light_camera, "a camera or a sequence of them"))
+    for each in cameras:
+        check_camera(name, each)
     if not cameras:
         raise ValueError("`receivers(light_camera)` must be at least one camera, got none.")
     if len(cameras) > 1 and not all(isinstance(each, PinholeCamera) for each in cameras):
@@ -98,6 +91,7 @@ def receivers(
     if normal is not None:
         normal = parameter("receivers(normal=...)", normal, (*depth.shape, 3))
     offset = parameter("receivers(normal_offset=...)", normal_offset)
+    check("receivers(normal_offset=...)", offset, np.isfinite, "finite")
     return _receivers(depth, camera, cameras, normal, offset)
 
 
@@ -122,7 +116,7 @@ def _receivers(depth, camera, cameras, normal, offset) -> Receivers:
 
 
 def _seen(
-    points: _Vectors, normal: _Vectors, shown: Bool[Array, "height width"], camera: _Camera
+    points: _Vectors, normal: _Vectors, shown: Bool[Array, "height width"], camera: Camera
 ) -> Receivers:
     """The points in one camera's space; -1 for those that are not before it."""
     before = shown & (camera.project(points)[1] > 0)
@@ -141,7 +135,7 @@ def _seen(
     return Receivers(u, v, z, jnp.where(before, slope, 0))
 
 
-def _axes(camera: _Camera, pixels: Float[Array, "height width 2"], z: _Image):
+def _axes(camera: Camera, pixels: Float[Array, "height width 2"], z: _Image):
     """How a world point moves with its u, v and z: exact, for it is linear in each."""
     zero = jnp.zeros_like(pixels)
     right, down = (zero.at[..., axis].set(1) for axis in (0, 1))

@@ -6,19 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
-from jaxfx._numerics import check, parameter, safe_divide
+from jaxfx._checks import WholeNumber, check, parameter
+from jaxfx._numerics import safe_divide
 from jaxfx._sampling import bilinear
 from jaxfx.shadow import _taps
 from jaxfx.shadow.receivers import Receivers
 
 
 def variance(
-    shadow_map: Float[ArrayLike, "rows columns"],
+    shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    size: int,
+    size: WholeNumber,
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     min_variance: Float[ArrayLike, ""] | float = 0.0,
@@ -52,8 +53,10 @@ def variance(
     data = (shadow_map, receivers, bias, slope_bias)
     data = _taps.checked("variance", *data, size=size, middle=0.0)
     least = parameter("variance(min_variance=...)", min_variance)
-    check("variance(min_variance=...)", least, lambda v: v >= 0, "0 or positive")
-    return _variance(*data[:4], least, size)
+    check(
+        "variance(min_variance=...)", least, lambda v: (v >= 0) & (v < np.inf), "0 or positive"
+    )
+    return _variance(*data[:4], least, int(size))
 
 
 @ft.partial(jax.jit, static_argnames=("size",))

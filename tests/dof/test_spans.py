@@ -103,6 +103,7 @@ def test_the_order_of_pixels_is_irrelevant(kernel):
     np.testing.assert_allclose(sum(parts), compiled(kernel)(given), atol=1e-12)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize(("kernel", "reach"), [("shift", 8), ("tiles", 8), ("spans", 64)])
 def test_a_gradient_takes_at_most_24_pictures_of_memory(kernel, reach):
     shape = jax.ShapeDtypeStruct((512, 512, 3), jnp.float32)

@@ -33,18 +33,16 @@ def discs(bad, diameter, margin):
 
 @pytest.mark.parametrize("max_coc", [5.0, 40.0])
 def test_it_is_what_their_discs_overlap(max_coc):
-    """All pixels whose centre lies in a disc, and none beside it; of a lost depth the largest.
+    """All pixels whose centre lies in a disc, and none beside it; of no number the largest.
 
     The wide one is counted by tiles.
     """
     rng = np.random.default_rng(0)
-    depth = rng.uniform(1.5, 9, (70, 60))
+    coc = rng.uniform(0, 12, (70, 60))
     bad = rng.random((70, 60)) < 0.002
-    lost = np.argwhere(bad)[:2]
-    depth[*lost[0]], depth[*lost[1]] = np.nan, -1.0
-    diameter = np.asarray(LENS.circle_of_confusion(jnp.asarray(depth)))
-    diameter = np.where((depth > 0) & (diameter < max_coc), diameter, max_coc)
-    found = np.asarray(spoiled(jnp.asarray(bad), jnp.asarray(depth), LENS, max_coc))
+    coc[*np.argwhere(bad)[0]], coc[*np.argwhere(bad)[1]] = np.nan, np.inf
+    diameter = np.where(coc < max_coc, coc, max_coc)
+    found = np.asarray(spoiled(jnp.asarray(bad), jnp.asarray(coc), max_coc))
     assert found[discs(bad, diameter, 0)].all()
     assert not found[~discs(bad, diameter, 0.5)].any()
     assert not found.all()

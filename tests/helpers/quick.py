@@ -15,19 +15,24 @@ quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimizati
 
 
 @contextlib.contextmanager
-def quickly() -> Iterator[None]:
-    """Compile with little optimisation whatever is compiled in this context.
+def _compiled(is_optimised: bool) -> Iterator[None]:
+    """Compile with all optimisation, or with little, whatever is compiled in this context.
 
     JAX keeps compiled programs by function, types and a few settings, of which optimisation is
-    not one. The precision of matrix products is: it changes no value on a CPU, and keeps these
-    programs apart from those that are compiled with all optimisation.
+    not one. The precision of matrix products is: it changes no value on a CPU, and keeps the
+    two kinds of programs apart.
     """
-    jax.config.update("jax_disable_most_optimizations", True)
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", not is_optimised)
     try:
-        with jax.default_matmul_precision("highest"):
+        with jax.default_matmul_precision(None if is_optimised else "highest"):
             yield
     finally:
-        jax.config.update("jax_disable_most_optimizations", False)
+        jax.config.update("jax_disable_most_optimizations", before)
+
+
+quickly = functools.partial(_compiled, False)
+optimised = functools.partial(_compiled, True)
 
 
 def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: float) -> None:

@@ -51,6 +51,24 @@ def linear(codes, largest):
     return np.concatenate([curved[..., :colors], values[..., colors:]], axis=-1)
 
 
+@pytest.mark.parametrize("name", ["linear_from_srgb", "srgb_from_linear"])
+def test_the_curve_of_other_types(name):
+    curve, codes = inspect.unwrap(getattr(io, name)), np.linspace(0, 1, 101)
+    for kind in (np.float16, np.float32, ">f4"):
+        given = codes.astype(kind)
+        found = curve(given)
+        assert found.dtype == given.dtype.newbyteorder("=")
+        exact = curve(given.astype(np.float64))
+        # Computed in float32 at least: a half is off by its own rounding alone.
+        rounding = np.finfo(found.dtype).eps / 2 + 4 * np.finfo(np.float32).eps
+        np.testing.assert_allclose(found.astype(float), exact, rtol=rounding, atol=1e-7)
+    for wrong in (np.array([0, 127, 255], np.uint8), np.array([65535], np.uint16), [0, 1]):
+        with pytest.raises(ValueError, match=rf"`{name}\(\w+\)` must hold floats.*got \w?int"):
+            curve(wrong)
+    with pytest.raises(ValueError, match=rf"`{name}\(\w+\)` .* got a masked array"):
+        curve(np.ma.masked_array(codes))
+
+
 def test_the_curve_against_scikit_image():
     codes = np.linspace(0, 1, 1001)
     # The luminance of a grey is its linear value.

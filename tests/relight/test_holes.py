@@ -19,7 +19,9 @@ def numbered(size=SIZE, shader=None):
     index = np.arange(size[0] * size[1], dtype=float).reshape(size)
     vector = np.repeat(index[..., None], 3, axis=-1)
     shader = index.astype(np.int32) % 3 if shader is None else shader
-    return GBuffer(vector, shader, vector, vector, vector, vector, 1 + index, index)
+    return GBuffer(
+        vector, shader, vector, vector, vector, vector, 1 + index, index / index.size
+    )
 
 
 def holes(kind):
@@ -42,7 +44,7 @@ def test_is_the_nearest_covered_pixel(kind):
     gbuffer = numbered()
     filled, count = relight.fill_holes(gbuffer, coverage)
     assert int(count) == (coverage == 0).sum()
-    source = np.asarray(filled.roughness).astype(int)
+    source = np.rint(np.asarray(filled.roughness) * coverage.size).astype(int)
     row, column = np.divmod(source, SIZE[1])
     y, x = np.indices(SIZE)
     np.testing.assert_allclose(
@@ -81,7 +83,7 @@ def test_any_size(size):
     coverage[-1, -1] = 3
     filled, count = relight.fill_holes(numbered(size), coverage)
     assert int(count) == size[0] * size[1] - 1
-    assert (np.asarray(filled.roughness) == size[0] * size[1] - 1).all()
+    assert (np.asarray(filled.color) == size[0] * size[1] - 1).all()
 
 
 def test_a_filled_pixel_has_the_derivative_of_the_one_it_was_taken_from():

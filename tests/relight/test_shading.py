@@ -325,6 +325,7 @@ def test_gradients_of_render_equal_finite_differences():
     np.testing.assert_allclose(forward.sum(), expected, rtol=1e-7)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_reverse_memory_does_not_grow_with_the_lights():
     size = 64
     gbuffer = make_gbuffer(0, size, size, background=False)

@@ -222,6 +222,7 @@ def test_a_bad_pixel_stays_where_it_is():
     assert wrong[2, 3] and wrong.sum() == 1
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("count", [10, 100, 1000])
 def test_the_work_of_an_edit_does_not_depend_on_the_number_of_lights(count):
     """Counted in what is compiled; `benchmarks` has the times."""

@@ -323,6 +323,24 @@ def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
     assert shares[-1] > {5: 0.98, 15: 0.95, 30: 0.8}[degrees]
 
 
+@pytest.mark.parametrize("missing", [0.0, -2.0, np.nan])
+def test_a_missing_depth_is_nothing_and_stays_so(missing):
+    gbuffer = FRONTAL(TARGET)
+    depth = np.array(gbuffer.depth)
+    depth[1, 2] = missing
+    found, coverage = relight.synthesize([gbuffer], [TARGET], TARGET, depth=depth)
+    full, covered = relight.synthesize([gbuffer], [TARGET], TARGET, depth=gbuffer.depth)
+    assert covered[1, 2] == 1
+    there = np.ones(depth.shape, bool)
+    there[1, 2] = False
+    np.testing.assert_array_equal(coverage, np.where(there, covered, 0))
+    assert found.shader[1, 2] == -1
+    np.testing.assert_array_equal(np.asarray(found.color)[there], np.asarray(full.color)[there])
+    filled, count = relight.fill_holes(found, coverage)
+    assert int(count) == 0
+    assert filled.shader[1, 2] == -1
+
+
 def test_errors_name_the_argument():
     synthesize = inspect.unwrap(relight.synthesize)
     best = inspect.unwrap(relight.best_caches)
@@ -335,8 +353,6 @@ def test_errors_name_the_argument():
         synthesize([gbuffer], CAMERAS, TARGET, depth=depth)
     with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must have shape"):
         synthesize([gbuffer], [TARGET], TARGET, depth=depth[0])
-    with pytest.raises(ValueError, match=r"`synthesize\(depth=...\)` must be positive"):
-        synthesize([gbuffer], [TARGET], TARGET, depth=-depth)
     for name, value in (("tolerance", 0.0), ("angle", -1.0)):
         with pytest.raises(ValueError, match=rf"`synthesize\({name}=...\)` must be positive"):
             synthesize([gbuffer], [TARGET], TARGET, depth=depth, **{name: value})

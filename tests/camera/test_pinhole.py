@@ -250,6 +250,141 @@ def test_a_batch_of_cameras(rng, make):
         np.testing.assert_allclose(depth[i], expected_depth, rtol=1e-11)
 
 
+@pytest.mark.parametrize("make", CAMERAS)
+def test_rays_and_points(rng, make):
+    camera, size = make(rng), (3, 5)
+    origins, directions = camera.rays(height=np.int64(3), width=5)
+    assert origins.shape == directions.shape == (*size, 3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, rtol=1e-14)
+    # What lies on a ray is seen in the middle of its pixel.
+    pixels, depth = camera.project(origins + 2.5 * directions)
+    y, x = np.indices(size)
+    np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1) + 0.5, rtol=1e-10)
+    assert (np.asarray(depth) > 0).all()
+    if make is pinhole:
+        eye = np.asarray(camera.world_from_camera)[:3, 3]
+        np.testing.assert_array_equal(origins, np.broadcast_to(eye, (*size, 3)))
+    else:
+        np.testing.assert_allclose(camera.project(origins)[1], 0, atol=1e-12)
+
+    depth = rng.uniform(1, 3, size)
+    points = camera.points(depth)
+    np.testing.assert_allclose(camera.project(points)[0], pixels, rtol=1e-10)
+    np.testing.assert_allclose(camera.project(points)[1], depth, rtol=1e-12)
+    # They lie on the rays.
+    along = np.asarray(points - origins)
+    np.testing.assert_allclose(np.cross(along, directions), 0, atol=1e-10)
+    points_of = jax.jit(lambda camera, depth: camera.points(depth))
+    check_grads(points_of, (camera, jnp.asarray(depth)), order=1, rtol=1e-4)
+    rays_of = jax.jit(lambda camera: camera.rays(height=3, width=5))
+    check_grads(rays_of, (camera,), order=1, rtol=1e-4)
+
+
+@pytest.mark.parametrize("make", CAMERAS)
+def test_types_of_what_is_given(rng, make):
+    """Integers and lists are numbers; halves are computed with as floats."""
+    camera = make(rng)
+    points = np.array([[1, 2, -3], [4, 0, 5]])
+    expected = camera.project(points.astype(float))
+    for given in (points, points.tolist(), points.astype(np.int16), points.astype(">i8")):
+        for one, other in zip(camera.project(given), expected, strict=True):
+            assert one.dtype == jnp.float64
+            np.testing.assert_array_equal(one, other)
+    pixels, depth = np.array([[320, 100], [7, 9]]), np.array([2, 3], np.uint16)
+    expected = camera.unproject(pixels.astype(float), depth.astype(float))
+    for given in ((pixels, depth), (pixels.tolist(), depth.tolist()), (pixels, depth * 1.0)):
+        np.testing.assert_array_equal(camera.unproject(*given), expected)
+    for one, other in ((pixels, 2), (pixels[0], depth)):
+        broadcast = np.broadcast_to(one, (2, 2)), np.broadcast_to(other, 2)
+        np.testing.assert_array_equal(
+            camera.unproject(one, other), camera.unproject(*broadcast)
+        )
+    image = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)
+    np.testing.assert_array_equal(camera.points(image), camera.points(image * 1.0))
+
+    half = camera.unproject(pixels.astype(np.float16), np.float16([300, 400]))
+    assert half.dtype == jnp.float16
+    exact = camera.unproject(pixels.astype(float), np.array([300.0, 400.0]))
+    np.testing.assert_allclose(half.astype(float), exact, rtol=2e-3)
+    mixed = camera.unproject(pixels.astype(np.float32), np.array([300.0, 400.0]))
+    assert mixed.dtype == jnp.float64
+    np.testing.assert_allclose(mixed, exact, rtol=1e-14)
+
+
+def bad_poses():
+    pose = rigid(np.random.default_rng(3))
+    turned = lambda matrix: (
+        pose @ np.block([[np.array(matrix), np.zeros((3, 1))], [np.zeros((1, 3)), 1]])
+    )
+    row = pose.copy()
+    row[3] = [0, 0, 1, 1]
+    moved = pose.copy()
+    moved[0, 3] = np.nan
+    return {
+        "scale": turned(2 * np.eye(3)),
+        "slight scale": turned(1.01 * np.eye(3)),
+        "shear": turned([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
+        "mirror": turned(np.diag([1, 1, -1])),
+        "zero": np.zeros((4, 4)),
+        "last row": row,
+        "nowhere": moved,
+        "transposed": rigid(np.random.default_rng(4)).T,
+    }
+
+
+@pytest.mark.parametrize("kind", bad_poses())
+def test_poses_that_are_not_rigid(kind):
+    pose = bad_poses()[kind]
+    for name, make in (
+        ("PinholeCamera", lambda p: PinholeCamera(np.eye(3), p)),
+        ("OrthographicCamera", lambda p: OrthographicCamera(1, [0, 0], p)),
+    ):
+        message = rf"`{name}\(world_from_camera\)` must be a rotation and a finite position"
+        with pytest.raises(ValueError, match=message):
+            make(pose)
+        assert jax.jit(make)(pose) is not None  # A traced one can't be looked at.
+        # What a file rounds, and what is computed in halves, is rigid.
+        make(np.round(rigid(np.random.default_rng(5)), 4))
+        make(rigid(np.random.default_rng(5)).astype(np.float16))
+
+
+@pytest.mark.parametrize(
+    "intrinsics",
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 2]],
+        [[1, 0, 0], [0, 1, 0], [0.1, 0, 1]],
+        [[np.nan, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, np.inf], [0, 1, 0], [0, 0, 1]],
+        [[0, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
+    ],
+)
+def test_intrinsics_that_are_none(intrinsics):
+    message = r"`PinholeCamera\(intrinsics\)` must be finite, with positive focal lengths and"
+    with pytest.raises(ValueError, match=message):
+        PinholeCamera(intrinsics, np.eye(4))
+
+
+@pytest.mark.parametrize("make", CAMERAS)
+def test_a_batch_of_cameras_without_vmap(rng, make):
+    cameras = jax.tree.map(lambda *x: jnp.stack(x), make(rng), make(rng), make(rng))
+    calls = {
+        "project": lambda camera: camera.project(jnp.ones(3)),
+        "unproject": lambda camera: camera.unproject(jnp.ones(2), 1.0),
+        "rays": lambda camera: camera.rays(height=2, width=3),
+        "points": lambda camera: camera.points(jnp.ones((2, 3))),
+    }
+    for method, call in calls.items():
+        with pytest.raises(
+            ValueError,
+            match=r"must be one \w+Camera, whose .* Batches are made with `jax.vmap`",
+        ):
+            call(cameras)
+        first = jax.tree.leaves(jax.vmap(call)(cameras))[0][0]
+        one = jax.tree.leaves(call(jax.tree.map(lambda x: x[0], cameras)))[0]
+        np.testing.assert_allclose(first, one, rtol=1e-12, err_msg=method)
+
+
 def test_fields_are_strongly_typed():
     camera = OrthographicCamera(2, (1, 2), np.eye(4, dtype=int))
     assert all(leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(camera))

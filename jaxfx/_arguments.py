@@ -1,0 +1,59 @@
+"""Arguments of the package's own types: of the right kind, and one, not a batch of them.
+
+A camera, lens or light whose fields have a leading axis is a batch. `jax.vmap` takes it apart;
+without that its fields would be broadcast against an image's rows and columns without a word.
+"""
+
+from typing import Any, get_args
+
+import jax
+
+from jaxfx._checks import check_fields, check_shape, items
+from jaxfx.camera import Camera
+from jaxfx.gbuffer import GBuffer
+from jaxfx.lens import FocusPlanes, Lens, ThinLens
+from jaxfx.light import Light
+
+
+def check_camera(name: str, camera: Any, kind: Any = Camera) -> None:
+    """Raise `ValueError` for anything but one camera of a kind."""
+    if not isinstance(camera, kind):
+        kinds = " or ".join(f"a {each.__name__}" for each in get_args(kind) or (kind,))
+        kinds = kinds.replace("a O", "an O")
+        raise ValueError(f"`{name}` must be {kinds}, got {type(camera).__name__}.")
+    check_fields(name, camera)
+
+
+def check_lens(name: str, lens: Any) -> None:
+    """Raise `ValueError` for anything but one lens."""
+    if isinstance(lens, type) or not isinstance(lens, Lens):
+        raise ValueError(
+            f"`{name}` must be a lens, with `defocus(depth)`, `circle_of_confusion(depth)` and "
+            f"`focus_distance`, as a ThinLens is, got {lens!r:.60}."
+        )
+    if isinstance(lens, ThinLens | FocusPlanes):
+        check_fields(name, lens)
+    check_shape(f"{name}.focus_distance", lens.focus_distance, ())
+
+
+def check_light(name: str, light: Any, kind: Any = Light) -> None:
+    """Raise `ValueError` for anything but one light of a kind."""
+    if not isinstance(light, kind):
+        kinds = ", ".join(each.__name__ for each in get_args(kind) or (kind,))
+        raise ValueError(f"`{name}` must be one of {kinds}, got {type(light).__name__}.")
+    check_fields(name, light)
+
+
+def check_lights(name: str, lights: Any) -> tuple[Light, ...]:
+    """The lights of a sequence; `ValueError` names what is none."""
+    found = items(name, lights, "a sequence of lights")
+    for index, light in enumerate(found):
+        check_light(f"{name[:-1]}[{index}])", light)
+    return tuple(found)
+
+
+def check_gbuffer(name: str, gbuffer: Any) -> GBuffer:
+    """The cache, built again: it may have been edited as a pytree. `ValueError` otherwise."""
+    if not isinstance(gbuffer, GBuffer):
+        raise ValueError(f"`{name}` must be a GBuffer, got {type(gbuffer).__name__}.")
+    return GBuffer(*jax.tree.leaves(gbuffer))

@@ -1,0 +1,121 @@
+"""What cameras share: points in and out of their axes, and what they read."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Num
+
+from jaxfx._checks import check, check_fields, check_map, parameter
+from jaxfx._numerics import common_dtype, normalize, working_dtype
+from jaxfx._sampling import pixel_centers
+
+
+# Points, pixels and depths as people have them: arrays, numbers and lists, integers too.
+Points = Num[ArrayLike, "... 3"] | Sequence[Any]
+Pixels = Num[ArrayLike, "... 2"] | Sequence[Any]
+Depths = Num[ArrayLike, "..."] | Sequence[Any]
+DepthMap = Num[ArrayLike, "height width"] | Sequence[Any]
+
+# How far a rotation's columns may be from orthonormal: files hold four digits.
+_ORTHONORMAL = 1e-3
+
+
+def each(vector: Float[Array, " n"], like: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """`vector` for every one of `like`'s."""
+    return jnp.broadcast_to(vector.astype(like.dtype), like.shape)
+
+
+def transformed(
+    matrix: Float[Array, "3 3"], points: Float[Array, "... 3"]
+) -> Float[Array, "... 3"]:
+    """`matrix` times each of `points`, written out: a matrix product would not be fused."""
+    columns = matrix.astype(points.dtype).T
+    x, y, z = (points[..., i : i + 1] * each(columns[i], points) for i in range(3))
+    return x + y + z
+
+
+def to_world(
+    world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
+) -> Float[Array, "... 3"]:
+    """Points in camera axes, in the world's."""
+    pose = world_from_camera.astype(points.dtype)
+    return transformed(pose[:3, :3], points) + each(pose[:3, 3], points)
+
+
+def to_camera(
+    world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
+) -> Float[Array, "... 3"]:
+    """Points in world axes, in the camera's."""
+    pose = world_from_camera.astype(points.dtype)
+    return transformed(pose[:3, :3].T, points - each(pose[:3, 3], points))
+
+
+def rigid_pose(name: str, value: Any) -> Float[Array, "4 4"]:
+    """A rigid motion; `ValueError` for anything else that can be looked at."""
+    pose = parameter(name, value, (4, 4))
+    room = max(_ORTHONORMAL, 8 * float(jnp.finfo(pose.dtype).eps))
+
+    def is_rigid(numbers):
+        turn, last = numbers[:3, :3].astype(np.float64), numbers[3]
+        is_turn = np.abs(turn.T @ turn - np.eye(3)).max() < room and np.linalg.det(turn) > 0
+        return is_turn and np.isfinite(numbers).all() and (last == [0, 0, 0, 1]).all()
+
+    check(name, pose, is_rigid, "a rotation and a finite position over the row 0 0 0 1")
+    return pose
+
+
+def read_points(camera: Any, method: str, points: Any, size: int) -> Array:
+    """World points or pixels, in a float type; `ValueError` names what is none."""
+    name = f"{method}({'points' if size == 3 else 'pixels'})"
+    check_fields(f"{type(camera).__name__}.{method}", camera)
+    points = parameter(name, points, None)
+    if points.shape[-1:] != (size,):
+        raise ValueError(f"`{name}` must have shape (..., {size}), got {points.shape}.")
+    return points
+
+
+def read_pixels(camera: Any, pixels: Any, depth: Any) -> tuple[Array, Array, Any]:
+    """Pixels and depths that fit, in the type to compute in; and the type of the result."""
+    pixels = read_points(camera, "unproject", pixels, 2)
+    depth = parameter("unproject(depth)", depth, None)
+    try:
+        shape = jnp.broadcast_shapes(pixels.shape[:-1], depth.shape)
+    except ValueError:
+        raise ValueError(
+            f"`unproject(depth)` must have the pixels' shape {pixels.shape[:-1]}, "
+            f"got {depth.shape}."
+        ) from None
+    dtype = common_dtype(pixels.dtype, depth.dtype)
+    working = working_dtype(dtype)
+    pixels = jnp.broadcast_to(pixels.astype(working), (*shape, 2))
+    return pixels, jnp.broadcast_to(depth.astype(working), shape), dtype
+
+
+def read_map(depth: Any) -> tuple[Array, Array, Any]:
+    """The pixels of a depth image, and it, in the type to compute in; and its own type."""
+    depth = check_map("points(depth)", depth)
+    working = working_dtype(depth.dtype)
+    height, width = depth.shape
+    return pixel_centers(height, width, working), depth.astype(working), depth.dtype
+
+
+def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
+    """Pixels with a one."""
+    return jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
+
+
+def look_at_pose(eye: Any, target: Any, up: Any) -> Float[Array, "4 4"]:
+    """At `eye`, with `target` ahead and `up` towards the top of the picture."""
+    eye = parameter("look_at(eye)", eye, (3,))
+    target = parameter("look_at(target)", target, (3,))
+    up = parameter("look_at(up=...)", up, (3,))
+    forward = normalize(target - eye)
+    right = normalize(jnp.cross(forward, up))
+    check("look_at(target)", forward, lambda v: v.any(), "away from `eye`")
+    check("look_at(up=...)", right, lambda v: v.any(), "off the direction of view")
+    down = jnp.cross(forward, right)
+    columns = jnp.stack([right, down, forward, eye], axis=1)
+    return jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
