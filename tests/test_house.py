@@ -22,8 +22,8 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
 NUMERICS = {
-    *("_checks", "_extras", "_filter", "_linear", "_numerics", "_tiles", "_pyramid"),
-    "_sampling",
+    *("_checks", "_extras", "_filter", "_linear", "_numerics", "_progress", "_tiles"),
+    *("_pyramid", "_sampling"),
 }
 TYPES = {"_arguments", "camera", "lens", "light", "gbuffer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
