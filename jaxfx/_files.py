@@ -9,7 +9,7 @@ StrPath = str | os.PathLike[str]
 
 
 def check_suffix(name: str, path: StrPath, suffix: str) -> None:
-    """Raise `ValueError` if `path` ends in another suffix, which would tell of another format."""
+    """Raise `ValueError` if `path` ends in the suffix of another format."""
     found = Path(path).suffix
     if found and found.lower() != suffix:
         raise ValueError(f"`{name}` must end in `{suffix}`, the format, got `{path}`.")

@@ -82,9 +82,7 @@ def _open(path: StrPath, data: bytes, *, header_only: bool) -> list[Any]:
     try:
         return _quietly(OpenEXR.File, io.BytesIO(data), **options).parts
     except Exception as error:
-        raise ValueError(
-            f"`{path}` is damaged, or not what OpenEXR reads: {error}"
-        ) from error
+        raise ValueError(f"`{path}` is damaged, or not what OpenEXR reads: {error}") from error
 
 
 def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[int, int]:

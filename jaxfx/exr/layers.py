@@ -184,9 +184,10 @@ def read(
     **Returns:** arrays by name, height width or height width channel.
 
     **Raises:** `ValueError` that names the file where it is damaged, not EXR, deep, subsampled,
-    too large or has one name twice: all channels come back, or none. `OSError` where it can't be opened. EXR has
-    no checksum, so `write` puts one into the header: any bit that flips in its files is
-    noticed. In a file of another program, damage that makes another valid file is not.
+    too large or has one name twice: all channels come back, or none. `OSError` where it can't
+    be opened. EXR has no checksum, so `write` puts one into the header: any bit that flips in
+    its files is noticed. In a file of another program, damage that makes another valid file is
+    not.
 
     **Gradient:** none; the host side.
     """
