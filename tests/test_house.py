@@ -21,8 +21,8 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
-NUMERICS = {"_filter", "_linear", "_numerics", "_tiles", "_pyramid", "_sampling"}
-TYPES = {"camera", "lens", "light", "gbuffer"}
+NUMERICS = {"_filter", "_holes", "_linear", "_numerics", "_tiles", "_pyramid", "_sampling"}
+TYPES = {"camera", "depth", "gbuffer", "lens", "light"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}

@@ -109,23 +109,28 @@ def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[in
     return height, width
 
 
-def named_planes(path: StrPath, parts: list[Part]) -> dict[str, np.ndarray]:
-    """The channels of all parts, each under a name of its own.
+def full_names(path: StrPath, parts: list[Part]) -> dict[str, tuple[Part, str]]:
+    """The channels of all parts, each under a name of its own: its part, and its name there.
 
     The first part's keep their names. A later part's have the part's name in front where they
     have no dot, or where another part has a channel of that name: two views with the same
     passes, say.
     """
     holders = Counter(name for part in parts for name in part.planes)
-    planes: dict[str, np.ndarray] = {}
+    channels: dict[str, tuple[Part, str]] = {}
     for i, part in enumerate(parts):
         label = part.header.get("name", "")
-        for name, plane in part.planes.items():
+        for name in part.planes:
             is_prefixed = i and label and ("." not in name or holders[name] > 1)
             full = f"{label}.{name}" if is_prefixed else name
-            if full in planes:
+            if full in channels:
                 raise ValueError(
                     f"`{path}` must name its channels differently, got `{full}` twice."
                 )
-            planes[full] = plane
-    return planes
+            channels[full] = part, name
+    return channels
+
+
+def planes_of(channels: Mapping[str, tuple[Part, str]]) -> dict[str, np.ndarray]:
+    """The pixels of each of `full_names`."""
+    return {full: part.planes[name] for full, (part, name) in channels.items()}

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.exr import _seal
-from jaxfx.exr._parts import CHUNK, MAX_PIXELS, named_planes, read_parts
+from jaxfx.exr._parts import CHUNK, MAX_PIXELS, full_names, planes_of, read_parts
 
 
 _VECTORS = {"normal", "position", "direction", "tangent", "velocity", "motion", "vector"}
@@ -130,7 +130,7 @@ def read_planes(
 ) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
     """Every channel of a file by its full name, and the header of its first part."""
     parts = read_parts(path, max_pixels, verify)
-    return named_planes(path, parts), parts[0].header
+    return planes_of(full_names(path, parts)), parts[0].header
 
 
 def assemble(path: StrPath, planes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
