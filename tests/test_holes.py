@@ -82,7 +82,7 @@ def test_cheapest_sources(seed):
 
 
 def test_a_path_round_a_wall():
-    """Through the gap below a wall that the guide shows, though the wall's own depth is near."""
+    """Through the gap below a wall that the guide shows, not over the wall."""
     walls = np.zeros((5, 9))
     walls[:4, 4] = 1
     depth = np.full((5, 9), NAN)
