@@ -155,14 +155,14 @@ def test_a_transparent_colour_has_alpha_0(tmp_path, channels, dtype):
 def test_a_transparent_grey_of_few_bits(tmp_path, bits):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 8 // bits, 1, bits, 0, 0, 0, 0))
     row = chunk(b"IDAT", zlib.compress(b"\0" + bytes([0b01001110])))
-    key = chunk(b"tRNS", struct.pack(">H", 1))
+    values = np.array([[[0b01001110 >> at & 2**bits - 1] for at in range(8 - bits, -1, -bits)]])
+    key = chunk(b"tRNS", struct.pack(">H", values[0, 0, 0]))
     (tmp_path / "a.png").write_bytes(
         b"\x89PNG\r\n\x1a\n" + header + key + row + chunk(b"IEND", b"")
     )
-    values = np.array([0b01001110 >> at & 2**bits - 1 for at in range(8 - bits, -1, -bits)])
-    image = io.read_png(tmp_path / "a.png")[0]
-    np.testing.assert_array_equal(image[:, 1], values != 1)
-    np.testing.assert_allclose(image[:, :1], linear(values[:, None], 2**bits - 1), rtol=3e-7)
+    image = io.read_png(tmp_path / "a.png")
+    np.testing.assert_array_equal(image[..., 1:], values != values[0, 0, 0])
+    np.testing.assert_allclose(image[..., :1], linear(values, 2**bits - 1), rtol=3e-7)
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.55, 1 / 2.2])
