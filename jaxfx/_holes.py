@@ -76,12 +76,14 @@ def cheapest_sources(
     farthest = jnp.max(jnp.where(jnp.isfinite(depth), depth, 0))
     # A sky is as if twice as far as the farthest: beyond all, and within reach.
     sky = jnp.where(farthest > 0, 2 * farthest, 1)
-    shown = jnp.sqrt(jnp.clip(jnp.nan_to_num(guide), 0, 1))
-    planes = shown, *(jnp.log(jnp.minimum(each, sky)) for each in (depth, expected))
-    # A quarter turn for each of the four directions from which a step can come.
-    steps = [
-        _steps_down(*(jnp.rot90(plane, turn) for plane in planes), unit) for turn in range(4)
+    planes = [
+        jnp.sqrt(jnp.clip(jnp.nan_to_num(guide), 0, 1)),
+        jnp.log(jnp.minimum(depth, sky)),
+        jnp.log(jnp.minimum(expected, sky)),
     ]
+    # A quarter turn for each of the four directions from which a step can come.
+    turned = [[jnp.rot90(plane, turn) for plane in planes] for turn in range(4)]
+    steps = [_steps_down(shown, log, limit, unit) for shown, log, limit in turned]
     is_known = ~jnp.isnan(depth)
     source = jnp.arange(height * width).reshape(height, width)
     paths = jnp.where(is_known, 0, jnp.inf).astype(depth.dtype), source

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._holes import cheapest_sources, farther_ends
@@ -167,16 +167,17 @@ def from_ray_distance(
     is_known = (values > 0) & ~is_nothing
     known = jnp.where(is_known, values, 1)
     if isinstance(camera, PinholeCamera):
-        known = known * _axis_per_ray(camera, values.shape, values.dtype)
+        known = known * _axis_per_ray(camera, values)
     return _with_holes(known, is_known, is_nothing)
 
 
 def _axis_per_ray(
-    camera: PinholeCamera, shape: tuple[int, int], dtype: DTypeLike
+    camera: PinholeCamera, like: Float[Array, "height width"]
 ) -> Float[Array, "height width"]:
     """How far along the axis one goes in each pixel, for a unit along its ray."""
-    pixels = pixel_centers(*shape, dtype)
-    columns = jnp.linalg.inv(camera.intrinsics).astype(dtype).T[:, None, None, :]
+    height, width = like.shape
+    pixels = pixel_centers(height, width, like.dtype)
+    columns = jnp.linalg.inv(camera.intrinsics).astype(like.dtype).T[:, None, None, :]
     rays = pixels[..., :1] * columns[0] + pixels[..., 1:] * columns[1] + columns[2]
     return rays[..., 2] / jnp.linalg.norm(rays, axis=-1)
 

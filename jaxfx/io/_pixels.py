@@ -22,7 +22,7 @@ def png_values(data: bytes) -> np.ndarray:
     # Of 16-bit colours Pillow keeps the high bytes. It gives the low ones when asked for the
     # other byte order, and both of grey and alpha as the four channels of RGBA.
     header = Image.open(io.BytesIO(data), formats=("PNG",))
-    layout = header.tile[0][3]
+    layout = str(header.tile[0][3])
     largest = 65535 if "16" in layout else 255
     if layout == "LA;16B":
         high_low = pixels("RGBA")

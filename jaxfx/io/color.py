@@ -60,10 +60,8 @@ def read_color(
         return decode_png(path, data)
     if data.startswith(JPEG):
         return _decode_jpeg(path, data)
-    raise ValueError(
-        f"`{path}` must be a PNG, JPEG or EXR file, "
-        + (f"got one that begins with {data[:4]!r}." if data else "got an empty one.")
-    )
+    found = f"one that begins with {data[:4]!r}" if data else "an empty one"
+    raise ValueError(f"`{path}` must be a PNG, JPEG or EXR file, got {found}.")
 
 
 def _decode_jpeg(path: StrPath, data: bytes) -> np.ndarray:

@@ -16,6 +16,7 @@ from jaxfx.io.color import EXR, JPEG, PNG
 _NPY, _ZIP = b"\x93NUMPY", b"PK\x03\x04"
 # "Pf", width, height and scale, each ended by one or more blanks, the last by exactly one.
 _PFM = re.compile(rb"(P[fF]4?)\s+(\d+)\s+(\d+)\s+([-+0-9.eE]+)\s")
+_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 # Greys that Pillow gives as the file has them; it spreads those of fewer bits.
 _GREYS = ("L", "I;16B")
 
@@ -132,18 +133,18 @@ def _from_pfm(path: StrPath, data: bytes) -> np.ndarray:
     programs multiply by it, or divide.
     """
     header = _PFM.match(data)
-    try:
-        kind, width, height, scale = header.groups() if header else ()
-        factor = float(scale)
-        shape = int(height), int(width), 3 if kind == b"PF" else 1
-    except ValueError as error:
-        raise ValueError(f"`{path}` is damaged or not PFM: {error}") from error
-    body = data[header.end() :] if header else b""
+    if not header:
+        raise ValueError(f"`{path}` is damaged or not PFM: it begins with {data[:40]!r}.")
+    kind, width, height, number = header.groups()
+    shape = int(height), int(width), 3 if kind == b"PF" else 1
+    body = data[header.end() :]
+    # Anything but a number above or below 0 leaves the order of bytes open.
+    factor = float(number) if _NUMBER.fullmatch(number) else 0.0
     is_whole = len(body) == 4 * shape[0] * shape[1] * shape[2]
     if kind.endswith(b"4") or not is_whole or not 0 < abs(factor) < float("inf"):
         raise ValueError(
-            f"`{path}` is damaged: its header {data[:40].splitlines()[:3]} does not fit its "
-            f"{len(body)} bytes of pixels."
+            f"`{path}` is damaged: its header {header.group()!r} does not fit its {len(body)} "
+            "bytes of pixels."
         )
     values = np.frombuffer(body, "<f4" if factor < 0 else ">f4").reshape(shape)
     return values[::-1].astype(np.float32)
