@@ -2,7 +2,6 @@
 
 import builtins
 import io
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import FunctionType
@@ -112,23 +111,36 @@ def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[in
 def full_names(path: StrPath, parts: list[Part]) -> dict[str, tuple[Part, str]]:
     """The channels of all parts, each under a name of its own: its part, and its name there.
 
-    The first part's keep their names. A later part's have the part's name in front where they
-    have no dot, or where another part has a channel of that name: two views with the same
-    passes, say.
+    A name with a dot stays as it is where one part alone has it. Where the parts that share
+    it are of different views, the view stands before its last word, as in a file of one part:
+    `depth.right.Z`. Every other name of a later part follows the part's.
     """
-    holders = Counter(name for part in parts for name in part.planes)
+    views: dict[str, list[str | None]] = {}
+    for part in parts:
+        for name in part.planes:
+            views.setdefault(name, []).append(part.header.get("view"))
     channels: dict[str, tuple[Part, str]] = {}
     for i, part in enumerate(parts):
         label = part.header.get("name", "")
         for name in part.planes:
-            is_prefixed = i and label and ("." not in name or holders[name] > 1)
-            full = f"{label}.{name}" if is_prefixed else name
+            layer, dot, letter = name.rpartition(".")
+            is_shared = len(views[name]) > 1
+            if dot and is_shared and None not in views[name] and _differ(views[name]):
+                full = f"{layer}.{part.header['view']}.{letter}"
+            elif i and label and (not dot or is_shared):
+                full = f"{label}.{name}"
+            else:
+                full = name
             if full in channels:
                 raise ValueError(
                     f"`{path}` must name its channels differently, got `{full}` twice."
                 )
             channels[full] = part, name
     return channels
+
+
+def _differ(names: list[Any]) -> bool:
+    return len(set(names)) == len(names)
 
 
 def planes_of(channels: Mapping[str, tuple[Part, str]]) -> dict[str, np.ndarray]:

@@ -170,8 +170,9 @@ def read(
     Files of other programs are read too, of one part or several, in scan lines or tiles; an
     array is the data window, at full resolution. A channel of no colour or vector, a bare `Z`
     say, is a layer under its full name. The channels of a later part have the part's name in
-    front where they have no dot, or where another part has a channel of that name: the depths
-    of two views in two parts are `depth` and `right.depth`.
+    front where they have no dot. Where several parts have one name with a dot, it holds the
+    part's view, if they differ in that, else the part's name in front: the depths of two views
+    in two parts are `depth.left` and `depth.right`.
 
     **Arguments:**
 

@@ -35,8 +35,8 @@ def read_rgbd(
 
     - `path`: the file.
     - `layer`: the name in front of the passes, `"ViewLayer"` say, of a view too
-      (`"ViewLayer.left"`). Without it the passes with no name in front, or the only layer that
-      has both.
+      (`"ViewLayer.left"`). Without it the passes with no name in front, which are those of the
+      first view, or the only layer that has both.
     - `max_pixels`, `verify`: as for `read`.
 
     **Returns:** the image, height width channel, with the channels that the file has (1, 3 or
@@ -49,10 +49,18 @@ def read_rgbd(
 
     **Gradient:** none; the host side.
     """
-    channels = full_names(path, read_parts(path, max_pixels, verify))
+    parts = read_parts(path, max_pixels, verify)
+    channels = full_names(path, parts)
     layers = assemble(path, planes_of(channels))
     images, _ = images_of(layers)
     depth_keys = depths_of(layers)
+    # What bears no name is of the first view, whose name some of its passes may bear.
+    if view := parts[0].header.get(
+        "view", next(iter(parts[0].header.get("multiView", [])), "")
+    ):
+        for found in (images, depth_keys):
+            if key := [found[name] for name in ("", view) if name in found]:
+                found[""] = found[view] = key[0]
     chosen = choose(path, "an image and a depth", images.keys() & depth_keys.keys(), layer)
     keys = images[chosen], depth_keys[chosen]
     windows = [_windows(channels, key) for key in keys]

@@ -115,49 +115,57 @@ def test_views_in_one_part(tmp_path):
     np.testing.assert_array_equal(layers["right"][..., 0], smooth() + 3)
 
 
-def part(name, header=FLAT, size=(37, 53), **planes):
+def part(name, header=FLAT, size=(37, 53), view=None, **planes):
     """A part of planes that differ by a number; all share one display."""
     display = (np.zeros(2, np.int32), np.array([52, 36], np.int32))
     named = {channel.replace("_", "."): smooth(size=size) + v for channel, v in planes.items()}
-    return OpenEXR.Part(header | {"displayWindow": display}, named, name)
+    seen = {} if view is None else {"view": view}
+    return OpenEXR.Part(header | seen | {"displayWindow": display}, named, name)
 
 
-def test_parts_that_share_names(tmp_path):
-    """Two views with the same passes, a part each."""
+@pytest.mark.parametrize("views", [("left", "right"), (None, None), ("left", "left")])
+def test_parts_that_share_names(tmp_path, views):
+    """Two parts with the same passes, told apart by their views, or else by their names."""
     OpenEXR.File(
         [
-            part("left", R=0, G=1, B=2, depth_Z=3, only_V=4),
-            part("right", R=5, G=6, B=7, depth_Z=8, other_V=9),
+            part("one", view=views[0], R=0, G=1, B=2, depth_Z=3, only_V=4),
+            part("two", view=views[1], R=5, G=6, B=7, depth_Z=8, other_V=9),
         ]
     ).write(str(tmp_path / "a.exr"))
     layers = exr.read(tmp_path / "a.exr")
-    assert layers.keys() == {"", "depth", "only", "right", "right.depth", "other"}
+    depths = ["depth.left", "depth.right"] if views[1] == "right" else ["depth", "two.depth"]
+    assert layers.keys() == {"", "only", "two", "other", *depths}
     flat = {name: layer for name, layer in layers.items() if layer.ndim == 2}
-    expected = {"depth": 3, "only": 4, "right.depth": 8, "other": 9}
+    expected = {depths[0]: 3, "only": 4, depths[1]: 8, "other": 9}
     assert_layers(flat, {name: smooth() + value for name, value in expected.items()})
     np.testing.assert_array_equal(
-        layers["right"], np.stack([smooth() + i for i in (5, 6, 7)], -1)
+        layers["two"], np.stack([smooth() + i for i in (5, 6, 7)], -1)
     )
 
 
-def test_a_part_for_each_pass(tmp_path):
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_a_part_for_each_pass(tmp_path, is_seen):
     """As in the official multi-part images: names with a dot, in two of the later parts."""
+    left, right = ("left", "right") if is_seen else (None, None)
     OpenEXR.File(
         [
-            part("rgba_right", R=0, G=1, B=2, A=3),
-            part("depth_left", Z=4),
-            part("forward_left", forward_u=5, forward_v=6),
-            part("mask_left", mask_mask=7, size=(20, 10)),
-            part("forward_right", forward_u=8, forward_v=9),
-            part("rgba_left", TILED, R=10, G=11, B=12, A=13),
+            part("rgba_right", view=right, R=0, G=1, B=2, A=3),
+            part("depth_left", view=left, Z=4),
+            part("forward_left", view=left, forward_u=5, forward_v=6),
+            part("mask_left", view=left, mask_mask=7, size=(20, 10)),
+            part("forward_right", view=right, forward_u=8, forward_v=9),
+            part("rgba_left", TILED, view=left, R=10, G=11, B=12, A=13),
         ]
     ).write(str(tmp_path / "a.exr"))
     layers = exr.read(tmp_path / "a.exr")
-    assert layers.keys() == {
-        *("", "depth_left", "rgba_left", "mask.mask"),
-        *(f"forward_{side}.forward.{axis}" for side in ("left", "right") for axis in "uv"),
-    }
-    np.testing.assert_array_equal(layers["forward_right.forward.v"], smooth() + 9)
+    names = [
+        f"forward.{side}.{axis}" if is_seen else f"forward_{side}.forward.{axis}"
+        for side in ("left", "right")
+        for axis in "uv"
+    ]
+    assert layers.keys() == {"", "depth_left", "rgba_left", "mask.mask", *names}
+    for value, name in zip((5, 6, 8, 9), names, strict=True):
+        np.testing.assert_array_equal(layers[name], smooth() + value)
     assert layers["mask.mask"].shape == (20, 10)
     assert layers["rgba_left"].shape == (37, 53, 4)
 

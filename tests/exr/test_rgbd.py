@@ -101,29 +101,61 @@ def test_what_write_wrote(tmp_path):
     np.testing.assert_array_equal(found_depth[2], [np.nan] * 3 + [1] * 6)
 
 
-def part(name, channels, window=None):
+def part(name, channels, window=None, view=None):
     header = FLAT | {"displayWindow": (np.zeros(2, np.int32), np.array([8, 5], np.int32))}
     if window:
         header["dataWindow"] = tuple(np.array(corner, np.int32) for corner in window)
-    return OpenEXR.Part(header, channels, name)
+    return OpenEXR.Part(header | ({} if view is None else {"view": view}), channels, name)
 
 
-def views(windows=(None, None)):
+def views(windows=(None, None), has_view=True):
     parts = []
     for i, (view, window) in enumerate(zip(("left", "right"), windows, strict=True)):
         planes = {c: image(start=i)[..., j].copy() for j, c in enumerate("RGB")}
-        parts.append(
-            part(view, planes | {"depth.Z": (depth(1e10) + i).astype(np.float32)}, window)
-        )
+        planes["depth.Z"] = (depth(1e10) + i).astype(np.float32)
+        parts.append(part(view, planes, window, view if has_view else None))
     return parts
 
 
-def test_a_view_for_each_part(tmp_path):
-    OpenEXR.File(views()).write(str(tmp_path / "a.exr"))
-    for i, layer in enumerate((None, "right")):
+@pytest.mark.parametrize("has_view", [True, False])
+def test_a_view_for_each_part(tmp_path, has_view):
+    """Without a name the first."""
+    OpenEXR.File(views(has_view=has_view)).write(str(tmp_path / "a.exr"))
+    layers = {None: 0, "right": 1} | ({"left": 0} if has_view else {})
+    for layer, i in layers.items():
         found_image, found_depth = exr.read_rgbd(tmp_path / "a.exr", layer=layer)
         np.testing.assert_array_equal(found_image, image(3, start=i))
         np.testing.assert_array_equal(found_depth, CLEAN + i)
+
+
+def test_views_in_one_part(tmp_path):
+    planes = {name: image()[..., j].copy() for j, name in enumerate("RGB")}
+    planes |= {f"right.{name}": 1 + plane for name, plane in planes.items()}
+    planes["depth.left.Z"] = depth(1e10).astype(np.float32)
+    planes["depth.right.Z"] = 1 + planes["depth.left.Z"]
+    header = FLAT | {"multiView": ["left", "right"]}
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    for layer, i in ((None, 0), ("left", 0), ("right", 1)):
+        found_image, found_depth = exr.read_rgbd(tmp_path / "a.exr", layer=layer)
+        np.testing.assert_array_equal(found_image, image(3, start=i))
+        np.testing.assert_array_equal(found_depth, CLEAN + i)
+
+
+def test_blender_with_a_part_for_each_pass_and_view(tmp_path):
+    parts = []
+    for i, view in enumerate(("left", "right")):
+        combined = {
+            f"ViewLayer.Combined.{c}": image(start=i)[..., j].copy()
+            for j, c in enumerate("RGBA")
+        }
+        z = {"ViewLayer.Depth.Z": (depth(1e10) + i).astype(np.float32)}
+        parts.append(part(f"ViewLayer.Combined-{view}", combined, view=view))
+        parts.append(part(f"ViewLayer.Depth-{view}", z, view=view))
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    for i, view in enumerate(("left", "right")):
+        found = exr.read_rgbd(tmp_path / "a.exr", layer=f"ViewLayer.{view}")
+        np.testing.assert_array_equal(found[0], image(start=i))
+        np.testing.assert_array_equal(found[1], CLEAN + i)
 
 
 def test_pixels_that_lie_elsewhere_are_refused(tmp_path):
