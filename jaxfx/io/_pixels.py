@@ -1,9 +1,17 @@
 """The numbers that a picture file stores, before any curve."""
 
 import io
+import logging
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from jaxfx._files import StrPath
+
+
+# How a colour profile names sRGB, in its two versions.
+_SRGB = (b"sRGB", "sRGB".encode("utf-16-be"))
 
 
 def png_values(data: bytes) -> np.ndarray:
@@ -53,3 +61,13 @@ def jpeg_values(data: bytes) -> np.ndarray:
         raise ValueError(f"`mode` must be grey or RGB, got {picture.mode}.")
     array = np.asarray(picture, np.float64)
     return array.reshape(*array.shape[:2], -1) / 255
+
+
+def log_profile(path: StrPath, facts: Mapping[Any, Any]) -> None:
+    """Say that a colour profile is not heeded, where it is another than sRGB."""
+    profile = facts.get("icc_profile") or b""
+    if profile and not any(name in profile for name in _SRGB):
+        logging.getLogger("jaxfx").warning(
+            "`%s` has a colour profile that is not heeded: its numbers are taken for sRGB.",
+            path,
+        )

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxfx import exr
 from jaxfx._files import StrPath
 from jaxfx.exr.rgbd import choose, images_of
-from jaxfx.io._pixels import jpeg_values
+from jaxfx.io._pixels import jpeg_values, log_profile
 from jaxfx.io.png import decode_png, linear_from_srgb
 
 
@@ -36,8 +36,8 @@ def read_color(
 
     **Arguments:**
 
-    - `path`: the file. PNG as by `read_png`; JPEG, whose numbers are sRGB, turned upright as
-      its Exif data say; EXR is linear.
+    - `path`: the file. PNG as by `read_png`; JPEG likewise, turned upright as its Exif data
+      say; EXR is linear.
     - `layer`: of an EXR file with several layers the one whose image is wanted, as for
       `exr.read_rgbd`; without it the main image, or the only one.
 
@@ -69,11 +69,13 @@ def _decode_jpeg(path: StrPath, data: bytes) -> np.ndarray:
 
     try:
         values = jpeg_values(data)
-        turn = Image.open(BytesIO(data), formats=("JPEG",)).getexif().get(_ORIENTATION, 1)
+        picture = Image.open(BytesIO(data), formats=("JPEG",))
+        turn = picture.getexif().get(_ORIENTATION, 1)
     except Exception as error:
         raise ValueError(
             f"`{path}` is damaged or not a JPEG of grey or RGB: {error}"
         ) from error
+    log_profile(path, picture.info)
     is_turned, down, right = _UPRIGHT.get(turn, (False, 1, 1))
     upright = (values.swapaxes(0, 1) if is_turned else values)[::down, ::right]
     return linear_from_srgb(upright).astype(np.float32)

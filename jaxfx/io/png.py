@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from jaxfx._files import StrPath, check_suffix, write_whole
-from jaxfx.io._pixels import png_values
+from jaxfx.io._pixels import log_profile, png_values
 
 
 # The gamma that files give to say sRGB.
@@ -86,7 +86,8 @@ def read_png(path: StrPath) -> Float[np.ndarray, "height width channel"]:
     An image of depth is none of colours: `read_depth` gives its numbers as they are.
 
     **Arguments:** `path`: a PNG file. Its numbers are taken for sRGB, or undone of the gamma
-    that the file names; alpha is linear. Colour profiles in the file are not heeded.
+    that the file names; alpha is linear. A colour profile in the file is not heeded, which is
+    logged where it is not sRGB.
 
     **Returns:** float32, height width channel, in [0, 1]: grey, grey and alpha, RGB or RGBA,
     as in the file, 16 bits in full; a palette is looked up, and a colour that the file calls
@@ -109,6 +110,7 @@ def decode_png(path: StrPath, data: bytes) -> np.ndarray:
         facts = Image.open(BytesIO(data), formats=("PNG",)).info
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
+    log_profile(path, facts)
     gamma = facts.get("gamma", _SRGB_GAMMA)
     if "srgb" in facts or abs(gamma / _SRGB_GAMMA - 1) < 0.05:
         return recolor(linear_from_srgb, values).astype(np.float32)

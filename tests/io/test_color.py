@@ -5,7 +5,7 @@ import io as streams
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 
 from jaxfx import exr, io
 
@@ -52,6 +52,17 @@ def test_photographs_are_turned_upright(tmp_path, orientation):
     with Image.open(path) as picture:
         expected = np.asarray(ImageOps.exif_transpose(picture))
     np.testing.assert_allclose(io.read_color(path), linear(expected), rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_a_profile_that_is_not_heeded_is_logged(tmp_path, caplog, kind):
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for profile, count in ((srgb, 0), (srgb.replace(b"s\0R\0G\0B", b"w\0i\0d\0e"), 1)):
+        assert (profile == srgb) == (count == 0)
+        Image.fromarray(codes()).save(tmp_path / "a", kind, icc_profile=profile)
+        io.read_color(tmp_path / "a")
+        assert len(caplog.records) == count
+    assert "a colour profile that is not heeded" in caplog.text
 
 
 def test_png_and_exr_under_any_name(tmp_path):
