@@ -188,6 +188,7 @@ def read_behind(arguments: argparse.Namespace, shape: tuple[int, ...]) -> tuple 
             f"--behind must have the first layer's size {shape}, got {depth.shape}"
         )
     depth = np.asarray(depths.clean(depth, scale=arguments.depth_scale or 1.0))
+    # What the second layer does not know hides nothing.
     return colors(image), np.where(np.isnan(depth), np.float32(np.inf), depth)
 
 

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._holes import cheapest_sources, farther_ends
-from jaxfx._numerics import check, is_concrete, parameter, working_dtype
+from jaxfx._numerics import check, check_image, is_concrete, parameter, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 
@@ -208,11 +208,12 @@ def fill(
 
     - `"rows"` takes the farther of the nearest known depths on either side in the row; in a
       row that knows nothing, in the column.
-    - `"guided"` takes the depth that comes along the cheapest path through the hole. A path
-      costs its length and, above all, the edges of `image` that it crosses, so that a depth
-      fills the surface that the image shows. One nearer than what `"rows"` would take pays
-      more at every step. Filled pixels that stand alone then take the median of their
-      neighbours. It knows nothing of slopes: a wide hole in a floor becomes flat steps.
+    - `"guided"` takes the depth at the end of the cheapest path through the hole. A path costs
+      its length and, above all, the edges of `image` that it crosses, so that a depth fills
+      the surface that the image shows. It also pays where it leaves the known pixels with a
+      depth that is nearer than what `"rows"` would take there. At last the filled pixels take
+      the median of the 3 x 3 about them, twice, so that none stands alone. It knows nothing of
+      slopes: a wide hole in a floor becomes flat steps.
 
     **Arguments:**
 
@@ -241,11 +242,11 @@ def fill(
         raise ValueError("`fill(depth)` must be known somewhere, got none above 0.")
     guide = jnp.zeros((*values.shape, 1), values.dtype)
     if image is not None:
-        guide = jnp.asarray(image)
-        if guide.ndim != 3 or guide.shape[:2] != values.shape or not guide.shape[2]:
+        guide = check_image("fill(image)", image)
+        if guide.shape[:2] != values.shape:
             raise ValueError(
-                f"`fill(image)` must have the height and width of the depth {values.shape}, "
-                f"and channels, got shape {guide.shape}."
+                f"`fill(image)` must have the depth's height and width {values.shape}, "
+                f"got shape {guide.shape}."
             )
     held, guide = jax.lax.stop_gradient((values, guide.astype(values.dtype)))
     source = farther_ends(held)

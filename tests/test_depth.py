@@ -354,9 +354,13 @@ GOOD = np.ones((2, 3))
         (lambda: depth.fill(0 * GOOD), r"`fill\(depth\)` must be known somewhere"),
         (
             lambda: depth.fill(GOOD, np.ones((3, 2, 3))),
-            r"`fill\(image\)` must have .* \(2, 3\), and channels, got shape \(3, 2, 3\)",
+            r"`fill\(image\)` must have the depth's .* \(2, 3\), got shape \(3, 2, 3\)",
         ),
-        (lambda: depth.fill(GOOD, GOOD), r"`fill\(image\)` must have"),
+        (lambda: depth.fill(GOOD, GOOD), r"`fill\(image\)` must be an image of shape"),
+        (
+            lambda: depth.fill(GOOD, np.ones((2, 3, 3), np.uint8)),
+            r"`fill\(image\)` must hold floats .* got uint8",
+        ),
         (lambda: depth.fill(GOOD, method="best"), r"`fill\(method=...\)` must be"),
     ],
 )
