@@ -28,3 +28,11 @@ def png_values(data: bytes) -> np.ndarray:
     if layout in ("RGB;16B", "RGBA;16B"):
         return (256 * pixels() + pixels(layout[:-1] + "L")) / 65535
     return pixels() / (65535 if layout == "I;16B" else 255)
+
+
+def jpeg_values(data: bytes) -> np.ndarray:
+    """The numbers of a JPEG file as RGB, height width 3, over their largest."""
+    from PIL import Image
+
+    picture = Image.open(io.BytesIO(data), formats=("JPEG",))
+    return np.asarray(picture.convert("RGB"), np.float64) / 255

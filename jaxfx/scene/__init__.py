@@ -6,7 +6,8 @@ rest. World axes are the mesh file's own (y up in most of them); cameras are thi
 
 from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
-from jaxfx.scene._scene import Material, Scene, Viewpoint
+from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._scene import Scene, Viewpoint
 from jaxfx.scene._still_life import still_life
 from jaxfx.scene._transfer import transfer, visible
 from jaxfx.scene._view import default_camera, default_lights
@@ -14,6 +15,7 @@ from jaxfx.scene._view import default_camera, default_lights
 
 __all__ = [
     "Material",
+    "Sampler",
     "Scene",
     "Viewpoint",
     "default_camera",

@@ -1,0 +1,230 @@
+"""OBJ files as parts of a scene.
+
+Source: Wavefront's OBJ, as in Bourke 1995; colours behind the positions, as MeshLab writes them.
+"""
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfx.io import linear_from_srgb
+from jaxfx.scene._images import find_file
+from jaxfx.scene._material import Material
+from jaxfx.scene._mtl import PLAIN, Library
+from jaxfx.scene._part import Part, UnreadableError, flat_normals, turned_normals
+from jaxfx.scene._polygons import triangulate
+
+
+_QUIET = {"mg", "bevel", "c_interp", "d_interp", "lod"}
+_LEFT_OUT = {"l": "lines", "p": "points", "shadow_obj": "shadow_obj", "trace_obj": "trace_obj"}
+
+
+def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
+    """The one part of an OBJ file, and what of the file it leaves out."""
+    reader = _Reader(path)
+    text = data.decode("utf-8-sig", "surrogateescape").replace("\\\r\n", " ")
+    for number, line in enumerate(text.replace("\\\n", " ").splitlines(), 1):
+        try:
+            reader.line(line)
+        except (UnreadableError, ValueError) as error:
+            raise UnreadableError(f"line {number}, {line.strip()!r:.60}: {error}") from error
+    return [reader.part()] if reader.sizes else [], reader.ignored | reader.library.ignored
+
+
+class _Reader:
+    """A file's numbers, line by line."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.library = Library()
+        self.ignored: set[str] = set()
+        self.missing: list[str] = []  # libraries that were not found
+        self.names_libraries = False
+        self.points: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+        self.corners: list[tuple[int, int, int]] = []
+        self.sizes: list[int] = []
+        self.face_groups: list[tuple[str, str, int]] = []  # object, material, smoothing group
+        self.object, self.group, self.material, self.smooth = "", "", "", 0
+
+    def line(self, line: str) -> None:
+        words = line.split("#")[0].split()
+        if not words:
+            return
+        key, rest = words[0], line.strip()[len(words[0]) :].strip()
+        if key in self.points:
+            self._point(key, words[1:])
+        elif key in ("f", "fo"):
+            self._face(words[1:])
+        elif key == "usemtl":
+            self.material = rest
+        elif key == "mtllib":
+            self._read_library(rest)
+        elif key == "o":
+            self.object = rest
+        elif key == "g":
+            self.group = " ".join(words[1:])
+        elif key == "s":
+            (group,) = words[1:]
+            self.smooth = 0 if group == "off" else int(group)
+        elif key in _LEFT_OUT:
+            self.ignored.add(_LEFT_OUT[key])
+        elif key not in _QUIET:
+            raise UnreadableError(f"{key!r} is not read")
+
+    def _point(self, key: str, words: list[str]) -> None:
+        values = [float(_plain(word)) for word in words]
+        counts = {"v": (3, 4, 6, 7), "vt": (1, 2, 3), "vn": (3,)}[key]
+        if len(values) not in counts:
+            raise UnreadableError(f"{len(values)} numbers")
+        if key != "v" and not np.isfinite(values).all():
+            raise UnreadableError("a number is not finite")
+        if len(values) > 4 and not all(0 <= value <= 1 for value in values[-3:]):
+            raise UnreadableError("a colour is not in [0, 1]")
+        self.points[key].append(values)
+
+    def _face(self, words: list[str]) -> None:
+        if len(words) < 3:
+            raise UnreadableError(f"a face of {len(words)} corners")
+        counts = [len(self.points[key]) for key in ("v", "vt", "vn")]
+        for word in words:
+            indices = word.split("/")
+            if len(indices) > 3 or not indices[0]:
+                raise UnreadableError(f"{word!r} is no corner")
+            place = [-1, -1, -1]
+            for i, index in enumerate(indices):
+                if index:
+                    value = int(_plain(index))
+                    place[i] = value - 1 if value > 0 else counts[i] + value
+                    if value == 0 or place[i] < 0:
+                        raise UnreadableError(f"there is no {value} among {counts[i]}")
+            self.corners.append((place[0], place[1], place[2]))
+        forms = {tuple(i < 0 for i in corner) for corner in self.corners[-len(words) :]}
+        if len(forms) > 1:
+            raise UnreadableError("its corners are not of one form")
+        self.sizes.append(len(words))
+        self.face_groups.append((self.object or self.group, self.material, self.smooth))
+
+    def _read_library(self, rest: str) -> None:
+        """One file whose name has spaces, or several files."""
+        self.names_libraries = True
+        try:
+            self.library.read(find_file(self.path.parent, rest, rest.strip("\"'")))
+            return
+        except UnreadableError:
+            names = shlex.split(rest.replace("\\", "/"))
+            if len(names) < 2:
+                self.missing.append(rest)
+                return
+        for name in names:
+            try:
+                found = find_file(self.path.parent, name)
+            except UnreadableError:
+                self.missing.append(name)
+            else:
+                self.library.read(found)
+
+    def part(self) -> Part:
+        corners = np.array(self.corners, np.intp)
+        for i, key in enumerate(self.points):
+            if corners[:, i].max() >= len(self.points[key]):
+                worst = corners[:, i].max() + 1
+                raise UnreadableError(f"a face has {key} {worst} of {len(self.points[key])}")
+        vertices, colors = self._vertices()
+        triangles, owner, crossing = triangulate(vertices[corners[:, 0]], self.sizes)
+        if crossing:
+            self.ignored.add(f"how {crossing} polygons that cross themselves are to be cut")
+        at = corners[triangles]
+        faces = at[..., 0]
+        has_uv = (at[..., 1] >= 0).all(axis=1)
+        names, face_objects = _numbered([group[0] for group in self.face_groups])
+        materials, face_materials = self._materials(owner, has_uv)
+        return Part(
+            vertices,
+            faces,
+            materials,
+            face_materials,
+            [name or self.path.name for name in names],
+            face_objects[owner],
+            self._normals(vertices, faces, at[..., 2], owner),
+            self._uv(at[..., 1], has_uv),
+            None,
+            None if colors is None else colors[faces],
+        )
+
+    def _vertices(self) -> tuple[np.ndarray, np.ndarray | None]:
+        rows = self.points["v"]
+        vertices = np.array([row[:3] for row in rows])
+        if all(len(row) < 6 for row in rows):
+            return vertices, None
+        white = [1.0, 1.0, 1.0]
+        colors = np.array([row[-3:] if len(row) > 4 else white for row in rows])
+        return vertices, linear_from_srgb(colors)
+
+    def _uv(
+        self, index: Int[np.ndarray, "face 3"], has_uv: np.ndarray
+    ) -> Float[np.ndarray, "face 3 2"] | None:
+        if not has_uv.any():
+            return None
+        values = np.array([(*row, 0.0)[:2] for row in self.points["vt"]])
+        return np.where(has_uv[:, None, None], values[index], 0)
+
+    def _normals(
+        self,
+        vertices: Float[np.ndarray, "vertex 3"],
+        faces: Int[np.ndarray, "face 3"],
+        index: Int[np.ndarray, "face 3"],
+        owner: Int[np.ndarray, " face"],
+    ) -> Float[np.ndarray, "face 3 3"]:
+        """The file's where it has them, those of smoothing groups elsewhere, else the faces'."""
+        normals = flat_normals(vertices, faces)
+        groups = np.array([group[2] for group in self.face_groups])[owner]
+        smooth = np.repeat(groups[:, None], 3, axis=1)
+        at = (smooth > 0) & (index < 0)
+        if at.any():
+            place = np.stack([smooth[at], faces[at]], axis=1)
+            _, shared = np.unique(place, axis=0, return_inverse=True)
+            sums = np.zeros((shared.max() + 1, 3))
+            np.add.at(sums, shared.ravel(), normals[at])
+            normals[at] = sums[shared.ravel()]
+        if (index >= 0).any():
+            given = np.array(self.points["vn"])
+            normals = np.where((index >= 0)[..., None], given[index], normals)
+        return turned_normals(normals, np.eye(3))
+
+    def _materials(
+        self, owner: np.ndarray, has_uv: np.ndarray
+    ) -> tuple[list[Material], np.ndarray]:
+        asked, index = _numbered([group[1] for group in self.face_groups])
+        keys = 2 * index[owner] + has_uv
+        used, face_materials = np.unique(keys, return_inverse=True)
+        materials = [self._material(asked[key // 2], bool(key % 2)) for key in used]
+        if self.missing and not any(asked):
+            self.ignored.add(f"{self.missing}, which are not there and not used")
+        return materials, face_materials.ravel()
+
+    def _material(self, name: str, has_uv: bool) -> Material:
+        if name in self.library:
+            return self.library.get(name, has_uv=has_uv)
+        if not name:
+            colored = any(len(row) > 4 for row in self.points["v"])
+            return Material() if colored else PLAIN
+        if self.missing:
+            raise UnreadableError(f"material {name!r} is in none of the files {self.missing}")
+        if self.names_libraries:
+            raise UnreadableError(f"no mtllib has the material {name!r}")
+        self.ignored.add("usemtl without any mtllib")
+        return PLAIN
+
+
+def _plain(word: str) -> str:
+    if "_" in word:  # which Python takes for a separator of digits
+        raise UnreadableError(f"{word!r} is no number")
+    return word
+
+
+def _numbered(values: list[str]) -> tuple[list[str], Int[np.ndarray, " value"]]:
+    """The different values in the order of their coming, and each one's index there."""
+    index = {value: number for number, value in enumerate(dict.fromkeys(values))}
+    return list(index), np.array([index[value] for value in values])
