@@ -5,8 +5,8 @@ rest. World axes are the mesh file's own (y up in most of them); cameras are thi
 """
 
 from jaxfx.scene._load import from_trimesh, load
-from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Scene, Viewpoint
 from jaxfx.scene._still_life import still_life
 from jaxfx.scene._transfer import transfer, visible

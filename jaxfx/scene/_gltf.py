@@ -19,6 +19,7 @@ from jaxfx.scene._part import (
     placed,
     turned_normals,
     unique_name,
+    unit,
 )
 
 
@@ -108,7 +109,9 @@ class _Reader:
         for index in roots:
             self.document.item("nodes", index)
             if index in self.parents or roots.count(index) > 1:
-                raise UnreadableError(f"node {index} of the scene has a parent, or is in it twice")
+                raise UnreadableError(
+                    f"node {index} of the scene has a parent, or is in it twice"
+                )
         found, waiting = [], list(reversed(roots))
         while waiting:
             index = waiting.pop()
@@ -198,7 +201,7 @@ class _Primitive:
             colors = self.get("COLOR_0", 3, 4)[:, :3]
             colors = (np.clip(colors, 0, 1) if self.weights.any() else colors)[faces]
         if "NORMAL" in self.attributes:
-            normals = turned_normals(self.get("NORMAL", 3), np.eye(3))[faces]
+            normals = unit(self.get("NORMAL", 3))[faces]
         none = np.zeros(len(faces), np.intp)
         uv, second = (*coordinates, None, None)[:2]
         return Part(
@@ -256,7 +259,9 @@ class _Primitive:
             return np.arange(self.count)
         record = self.document.item("accessors", self.record["indices"])
         if self.packed and "bufferView" not in record:
-            raise UnreadableError(f"indices are held by {', '.join(self.packed)}, which is not read")
+            raise UnreadableError(
+                f"indices are held by {', '.join(self.packed)}, which is not read"
+            )
         rows = self.document.accessor(self.record["indices"], widths=(1,))[:, 0]
         if rows.dtype.kind != "u" or rows.max() >= self.count:
             raise UnreadableError(f"indices of {self.count} vertices go up to {rows.max()}")

@@ -137,7 +137,7 @@ class Document:
                 (value, rows.shape[1], rows.dtype),
             )
         )
-        if where.dtype.kind != "u" or where.size and where.max() >= len(rows):
+        if where.dtype.kind != "u" or (where.size and where.max() >= len(rows)):
             raise UnreadableError(f"sparse values for {len(rows)} rows are at {where.max()}")
         rows = rows.copy()
         rows[where[:, 0]] = what
@@ -172,7 +172,7 @@ class Document:
         offset, length = take(record, "byteOffset", int, 0), take(record, "byteLength", int)
         if offset < 0 or length < 1 or offset + length > len(data):
             raise UnreadableError(
-                f"bufferView {index} has {length} bytes from {offset} on, its buffer {len(data)}"
+                f"bufferView {index} has {length} bytes from {offset} on, in {len(data)}"
             )
         stride = take(record, "byteStride", int, None)
         return memoryview(data)[offset : offset + length], stride

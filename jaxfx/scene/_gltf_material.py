@@ -64,8 +64,7 @@ class Materials:
         for name, info in infos.items():
             number, transform = places[name]
             images[name], wrap, nearest = self._texture(info)
-            second = number != sets[0]
-            samplers[name] = Sampler(wrap, nearest, transform, second)
+            samplers[name] = Sampler(wrap, nearest, transform, sets.index(number) > 0)
         color = vector(surface, "baseColorFactor", [1.0] * 4)[:3]
         if (color < 0).any() or (color > 1 + 1e-3).any():
             raise UnreadableError(f"'baseColorFactor' must be in [0, 1], got {color}")

@@ -89,7 +89,9 @@ def _by_pillow(data: bytes, name: str) -> _Texture:
     if not kinds and name.lower().endswith(".tga"):  # TGA files have no sign of their own
         kinds = ["TGA"]
     if not kinds:
-        raise UnreadableError(f"the image {name!r} is neither PNG, JPEG, BMP, TGA, TIFF nor WebP")
+        raise UnreadableError(
+            f"the image {name!r} is neither PNG, JPEG, BMP, TGA, TIFF nor WebP"
+        )
     with Image.open(io.BytesIO(data), formats=kinds) as image:
         return pillow_codes(image, name)
 

@@ -60,7 +60,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
         return assemble(parts, f"scene.load({name!r})")
 
 
-def from_trimesh(mesh: Any, *, smooth: bool = False) -> Scene:
+def from_trimesh(mesh: Any, *, smooth: bool | None = None) -> Scene:
     """A scene from a `trimesh.Trimesh` or `trimesh.Scene` in memory.
 
     **Arguments:**
@@ -68,9 +68,9 @@ def from_trimesh(mesh: Any, *, smooth: bool = False) -> Scene:
     - `mesh`: the mesh or scene, in any unit of length; it is read, not kept. Its vertex and
       face colours are taken to be sRGB. trimesh keeps them as bytes: of colours of more bits,
       as of uint16, it has lost the upper ones.
-    - `smooth`: whether corners have `mesh.vertex_normals`, those that were given to the mesh or
-      else those that trimesh makes of its faces. Without it each face is flat: trimesh does
-      not tell given ones from made ones.
+    - `smooth`: whether corners have `mesh.vertex_normals`; without it each face is flat. None:
+      where the mesh was given normals of its own, which are told by not being those that
+      trimesh makes of its faces.
 
     **Returns:** the `Scene`.
 
@@ -89,7 +89,7 @@ def from_trimesh(mesh: Any, *, smooth: bool = False) -> Scene:
             f"got {type(mesh).__name__}."
         )
     try:
-        parts = list(_trimesh.parts(mesh, lambda _: smooth))
+        parts = list(_trimesh.parts(mesh, smooth=smooth))
     except UnreadableError as error:
         raise ValueError(f"`scene.from_trimesh(mesh)` can't be taken over: {error}.") from error
     return assemble(parts, "scene.from_trimesh(mesh)")

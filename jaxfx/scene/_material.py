@@ -19,8 +19,8 @@ class Sampler:
 
     **Arguments:**
 
-    - `wrap`: what lies outside [0, 1], along u and along v: "repeat", "mirror" or "clamp", which
-      goes on with the texel at the edge.
+    - `wrap`: what lies outside [0, 1], along u and along v: "repeat", "mirror" or "clamp",
+      which goes on with the texel at the edge.
     - `nearest`: whether the nearest texel is taken. Else the read is bilinear.
     - `transform`: 2x3, from (u, v, 1) of the scene to the coordinates that are read.
     - `second_uv`: whether (u, v) comes from the scene's `second_uv`. Else it is `uv`.

@@ -16,7 +16,7 @@ from jaxfx.scene._part import UnreadableError
 
 PLAIN = Material(color=(0.8, 0.8, 0.8))
 _READ = {"kd", "ks", "ns", "illum", "map_kd"}
-# Light that surfaces do not send back by themselves, and what exporters write of every material.
+# Not used, and written by exporters of every material.
 _QUIET = {"ka", "tf", "ni", "sharpness", "tr", "d", "ke", "km"}
 _OPTIONS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}  # the most numbers that follow; else a word
 _HARMLESS = {"-blendu", "-blendv", "-texres", "-boost", "-imfchan", "-cc", "-bm", "-type"}
@@ -94,7 +94,7 @@ def _matters(key: str, rest: str) -> bool:
     """Whether a statement that is left out says more than the default."""
     if key in ("d", "ke"):
         try:
-            values = [float(word) for word in rest.split("#")[0].split()]
+            values = [float(word) for word in rest.split("#", maxsplit=1)[0].split()]
         except ValueError:
             return True
         return values[:1] != [1] if key == "d" else any(values)
@@ -102,7 +102,7 @@ def _matters(key: str, rest: str) -> bool:
 
 
 def _numbers(text: str, name: str, least: int, most: int) -> list[float]:
-    words = text.split("#")[0].split()
+    words = text.split("#", maxsplit=1)[0].split()
     try:
         values = [float(word) for word in words]
     except ValueError:

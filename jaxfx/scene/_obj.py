@@ -1,6 +1,6 @@
 """OBJ files as parts of a scene.
 
-Source: Wavefront's OBJ, as in Bourke 1995; colours behind the positions, as MeshLab writes them.
+Source: Wavefront's OBJ, as in Bourke 1995; colours after positions as MeshLab writes them.
 """
 
 import shlex
@@ -13,7 +13,7 @@ from jaxfx.io import linear_from_srgb
 from jaxfx.scene._images import find_file
 from jaxfx.scene._material import Material
 from jaxfx.scene._mtl import PLAIN, Library
-from jaxfx.scene._part import Part, UnreadableError, flat_normals, turned_normals
+from jaxfx.scene._part import Part, UnreadableError, flat_normals, unit
 from jaxfx.scene._polygons import triangulate
 
 
@@ -49,7 +49,7 @@ class _Reader:
         self.object, self.group, self.material, self.smooth = "", "", "", 0
 
     def line(self, line: str) -> None:
-        words = line.split("#")[0].split()
+        words = line.split("#", maxsplit=1)[0].split()
         if not words:
             return
         key, rest = words[0], line.strip()[len(words[0]) :].strip()
@@ -137,7 +137,7 @@ class _Reader:
             self.ignored.add(f"how {crossing} polygons that cross themselves are to be cut")
         at = corners[triangles]
         faces = at[..., 0]
-        has_uv = (at[..., 1] >= 0).all(axis=1)
+        has_uv = np.all(at[..., 1] >= 0, axis=1)
         names, face_objects = _numbered([group[0] for group in self.face_groups])
         materials, face_materials = self._materials(owner, has_uv)
         return Part(
@@ -177,7 +177,7 @@ class _Reader:
         index: Int[np.ndarray, "face 3"],
         owner: Int[np.ndarray, " face"],
     ) -> Float[np.ndarray, "face 3 3"]:
-        """The file's where it has them, those of smoothing groups elsewhere, else the faces'."""
+        """The file's where it has them; else of smoothing groups; else the faces'."""
         normals = flat_normals(vertices, faces)
         groups = np.array([group[2] for group in self.face_groups])[owner]
         smooth = np.repeat(groups[:, None], 3, axis=1)
@@ -191,7 +191,7 @@ class _Reader:
         if (index >= 0).any():
             given = np.array(self.points["vn"])
             normals = np.where((index >= 0)[..., None], given[index], normals)
-        return turned_normals(normals, np.eye(3))
+        return unit(normals)
 
     def _materials(
         self, owner: np.ndarray, has_uv: np.ndarray

@@ -33,6 +33,12 @@ class Part(NamedTuple):
     colors: Float[np.ndarray, "face 3 3"] | None = None
 
 
+def unit(vectors: Float[np.ndarray, "*any 3"]) -> Float[np.ndarray, "*any 3"]:
+    """Vectors of length 1; 0 stays 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1)
+
+
 def flat_normals(
     vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
 ) -> Float[np.ndarray, "face 3 3"]:
@@ -42,17 +48,15 @@ def flat_normals(
 
 
 def turned_normals(
-    normals: Float[np.ndarray, "*any 3"], matrices: Float[np.ndarray, "*any 3 3"]
+    normals: Float[np.ndarray, "*any 3"], matrices: Float[np.ndarray, "... 3 3"]
 ) -> Float[np.ndarray, "*any 3"]:
-    """Normals of surfaces that `matrices` transform, unit or 0.
+    """Unit normals of surfaces that `matrices`, one or one a normal, transform; 0 stays 0.
 
     The transpose of the adjugate turns them as the inverse's does, and bears a flat scaling.
     """
     a, b, c = np.moveaxis(matrices, -1, 0)
     rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
-    turned = sum(normals[..., i, None] * rows[i] for i in range(3))
-    length = np.linalg.norm(turned, axis=-1, keepdims=True)
-    return turned / np.where(length > 0, length, 1)
+    return unit(np.sum([normals[..., i, None] * rows[i] for i in range(3)], axis=0))
 
 
 def placed(part: Part, transform: Float[np.ndarray, "4 4"]) -> Part:
@@ -102,7 +106,7 @@ def assemble(parts: Iterable[Part], caller: str) -> Scene:
         chosen = [place[id(material)] for material in part.materials]
         normals = part.normals
         if normals is None:
-            normals = turned_normals(flat_normals(part.vertices, part.faces), np.eye(3))
+            normals = unit(flat_normals(part.vertices, part.faces))
         bare = np.zeros((count, 3, 2))
         for name, value in {
             "vertices": part.vertices,
@@ -116,10 +120,20 @@ def assemble(parts: Iterable[Part], caller: str) -> Scene:
         }.items():
             columns.setdefault(name, []).append(value)
         offset += len(part.vertices)
-    if all(part.second_uv is None for part in parts):
-        del columns["second_uv"]
     joined = {name: np.concatenate(values) for name, values in columns.items()}
-    return Scene(**joined, materials=tuple(materials.values()), names=tuple(names))
+    has_second = any(part.second_uv is not None for part in parts)
+    return Scene(
+        vertices=joined["vertices"],
+        faces=joined["faces"],
+        normals=joined["normals"],
+        uv=joined["uv"],
+        colors=joined["colors"],
+        materials=tuple(materials.values()),
+        face_materials=joined["face_materials"],
+        names=tuple(names),
+        face_objects=joined["face_objects"],
+        second_uv=joined["second_uv"] if has_second else None,
+    )
 
 
 def _require_finite(part: Part, caller: str) -> None:

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 from jaxfx.io import linear_from_srgb
 from jaxfx.scene._images import find_file, read_image
 from jaxfx.scene._material import Material
 from jaxfx.scene._mtl import PLAIN
-from jaxfx.scene._part import Part, UnreadableError, turned_normals
+from jaxfx.scene._part import Part, UnreadableError, unit
 from jaxfx.scene._polygons import triangulate
 
 
@@ -120,9 +120,9 @@ def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
         raise UnreadableError("it holds tristrips, which are not read")
     if "vertex" not in tables or "face" not in tables:
         return [], ignored
-    images = [find_file(path.parent, name) for name in textures]
-    images = [read_image(file.read_bytes(), str(file)) for file in images]
-    return [_part(path.name, tables["vertex"], tables["face"], images)], ignored
+    files = [find_file(path.parent, name) for name in textures]
+    images = [read_image(file.read_bytes(), str(file)) for file in files]
+    return [_part(path.name, tables["vertex"], tables["face"], images, ignored)], ignored
 
 
 def _head(data: bytes) -> tuple[str, dict[str, _Element], list[str], int]:
@@ -207,7 +207,9 @@ def _row(source: _Text | _Binary, element: _Element) -> Iterator[tuple[str, np.n
         yield name, source.take(kind, count)
 
 
-def _part(name: str, vertex: _Rows, face: _Rows, images: list[np.ndarray]) -> Part:
+def _part(
+    name: str, vertex: _Rows, face: _Rows, images: list[np.ndarray], ignored: set[str]
+) -> Part:
     vertices = vertex.stacked(("x", "y", "z"))
     named = [key for key in ("vertex_indices", "vertex_index") if key in face.lists]
     if vertices is None or not named:
@@ -220,6 +222,8 @@ def _part(name: str, vertex: _Rows, face: _Rows, images: list[np.ndarray]) -> Pa
     if (sizes < 3).any():
         raise UnreadableError(f"a face has {sizes.min()} corners")
     at, owner, crossing = triangulate(vertices[corners], sizes)
+    if crossing:
+        ignored.add(f"how {crossing} polygons that cross themselves are to be cut")
     faces = corners[at].astype(np.intp)
     colors, uv = _colors(vertex), _uv(vertex, face, sizes)
     if colors is not None:
@@ -246,7 +250,7 @@ def _part(name: str, vertex: _Rows, face: _Rows, images: list[np.ndarray]) -> Pa
         chosen,
         [name],
         np.zeros(len(faces), np.intp),
-        None if normals is None else turned_normals(normals, np.eye(3))[faces],
+        None if normals is None else unit(normals)[faces],
         uv,
         None,
         colors,
@@ -254,22 +258,22 @@ def _part(name: str, vertex: _Rows, face: _Rows, images: list[np.ndarray]) -> Pa
 
 
 def _colors(rows: _Rows) -> Float[np.ndarray, "row 3"] | None:
-    """Linear RGB of colours by their type: unsigned ones over their largest, floats as they are."""
+    """Linear RGB of colours by type: unsigned ones over their largest, floats as they are."""
     for names in _COLORS:
         if not all(name in rows.columns for name in names):
             continue
-        channels = []
-        for name in names:
-            codes = rows.columns[name]
-            if codes.dtype.kind == "i":
-                raise UnreadableError(f"{name} is of type {codes.dtype}, whose white is unknown")
-            top = np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1
-            channels.append(codes / top)
-        values = np.stack(channels, axis=1)
-        if not ((values >= 0) & (values <= 1)).all():
-            raise UnreadableError(f"{names} of type {codes.dtype} are not in [0, 1]")
+        values = np.stack([_shares(name, rows.columns[name]) for name in names], axis=1)
         return linear_from_srgb(values)
     return None
+
+
+def _shares(name: str, codes: Num[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+    if codes.dtype.kind == "i":
+        raise UnreadableError(f"{name} is of type {codes.dtype}, whose white is unknown")
+    shares = codes / (np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1)
+    if not ((shares >= 0) & (shares <= 1)).all():
+        raise UnreadableError(f"{name} of type {codes.dtype} is not in [0, 1]")
+    return shares.astype(np.float64)
 
 
 def _uv(

@@ -24,7 +24,9 @@ def triangulate(
     for size in np.unique(sizes):
         polygon = np.flatnonzero(sizes == size)
         corner = starts[polygon, None] + np.arange(size)
-        fan = np.stack([np.zeros(size - 2, np.intp), *(np.arange(size - 2) + i for i in (1, 2))])
+        fan = np.stack(
+            [np.zeros(size - 2, np.intp), *(np.arange(size - 2) + i for i in (1, 2))]
+        )
         cut = np.broadcast_to(fan.T, (len(polygon), size - 2, 3))
         if size > 3:
             flat = _flattened(points[corner])

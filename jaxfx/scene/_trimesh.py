@@ -1,6 +1,6 @@
 """Meshes of trimesh as parts of a scene."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,10 @@ def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
 
     if path.suffix.lower() in _ARCHIVES:
         raise UnreadableError("it is an archive: unpack it")
-    content = trimesh.load_scene(path, process=False)
-    # Nobody has asked a mesh that was just read for normals: what it has is the file's.
-    return list(parts(content, lambda mesh: "vertex_normals" in mesh._cache)), set()
+    return list(parts(trimesh.load_scene(path, process=False), smooth=None)), set()
 
 
-def parts(content: Any, is_smooth: Callable[[Any], bool]) -> Iterator[Part]:
+def parts(content: Any, *, smooth: bool | None) -> Iterator[Part]:
     """Every instance of a triangle mesh; points and curves are passed over."""
     import trimesh
 
@@ -36,10 +34,11 @@ def parts(content: Any, is_smooth: Callable[[Any], bool]) -> Iterator[Part]:
         transform, key = content.graph[node]
         mesh = content.geometry[key]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            yield placed(_part(str(node), mesh, is_smooth(mesh)), np.asarray(transform, np.float64))
+            part = _part(str(node), mesh, smooth)
+            yield placed(part, np.asarray(transform, np.float64))
 
 
-def _part(name: str, mesh: Any, smooth: bool) -> Part:
+def _part(name: str, mesh: Any, smooth: bool | None) -> Part:
     faces = np.asarray(mesh.faces)
     materials, index = _materials(mesh)
     return Part(
@@ -49,11 +48,31 @@ def _part(name: str, mesh: Any, smooth: bool) -> Part:
         index,
         [name],
         np.zeros(len(faces), np.intp),
-        np.nan_to_num(mesh.vertex_normals)[faces] if smooth else None,
+        _normals(mesh, smooth),
         _uv(mesh),
         None,
         _colors(mesh),
     )
+
+
+def _normals(mesh: Any, smooth: bool | None) -> Float[np.ndarray, "face 3 3"] | None:
+    """The vertices' normals at the corners; with None, only those that were given to the mesh.
+
+    trimesh keeps given normals and those it made itself in one place. Given ones are told by
+    not being what it makes of the same faces.
+    """
+    import trimesh
+
+    if smooth is False:
+        return None
+    normals = mesh.copy(
+        include_cache=True
+    ).vertex_normals  # asked of `mesh`, it would keep them
+    if smooth is None:
+        made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
+        if np.allclose(normals, made, atol=1e-5, equal_nan=True):
+            return None
+    return np.nan_to_num(normals)[mesh.faces]
 
 
 def _uv(mesh: Any) -> Float[np.ndarray, "face 3 2"] | None:
