@@ -126,8 +126,11 @@ def _map(text: str, path: Path) -> tuple[Path, Sampler]:
     words = {"-s": [1.0, 1.0], "-o": [0.0, 0.0], "-t": [0.0], "-mm": [0.0, 1.0]}
     clamp, rest = "off", text
     while rest.startswith("-"):
-        option, _, rest = rest.partition(" ")
-        key, rest = option.lower(), rest.strip()
+        option, _, after = rest.partition(" ")
+        key = option.lower()
+        if key not in _OPTIONS and key not in _HARMLESS and key != "-clamp":
+            break  # a name that begins with a dash
+        rest = after.strip()
         if key in _OPTIONS:
             values = []
             while len(values) < _OPTIONS[key]:
@@ -142,10 +145,8 @@ def _map(text: str, path: Path) -> tuple[Path, Sampler]:
             words[key] = values
         elif key == "-clamp":
             clamp, _, rest = rest.partition(" ")
-        elif key in _HARMLESS:
-            rest = rest.partition(" ")[2]
         else:
-            break  # a name that begins with a dash
+            rest = rest.partition(" ")[2]
         rest = rest.strip()
     if any(words["-t"]) or words["-mm"] != [0, 1] or clamp not in ("on", "off"):
         raise UnreadableError(f"a map has {text!r}: its turbulence or range is not read")

@@ -109,21 +109,23 @@ class _Reader:
     def _read_library(self, rest: str) -> None:
         """One file whose name has spaces, or several files."""
         self.names_libraries = True
-        try:
-            self.library.read(find_file(self.path.parent, rest, rest.strip("\"'")))
-            return
-        except UnreadableError:
-            names = shlex.split(rest.replace("\\", "/"))
-            if len(names) < 2:
-                self.missing.append(rest)
-                return
-        for name in names:
-            try:
-                found = find_file(self.path.parent, name)
-            except UnreadableError:
+        whole = self._library(rest, rest.strip("\"'"))
+        parts = shlex.split(rest.replace("\\", "/"))
+        if whole is None and len(parts) > 1:
+            found = {name: self._library(name) for name in parts}
+        else:
+            found = {rest: whole}
+        for name, path in found.items():
+            if path is None:
                 self.missing.append(name)
             else:
-                self.library.read(found)
+                self.library.read(path)
+
+    def _library(self, *names: str) -> Path | None:
+        try:
+            return find_file(self.path.parent, *names)
+        except UnreadableError:
+            return None
 
     def part(self) -> Part:
         corners = np.array(self.corners, np.intp)
@@ -177,7 +179,11 @@ class _Reader:
         index: Int[np.ndarray, "face 3"],
         owner: Int[np.ndarray, " face"],
     ) -> Float[np.ndarray, "face 3 3"]:
-        """The file's where it has them; else of smoothing groups; else the faces'."""
+        """The file's where it has them; else of smoothing groups; else the faces'.
+
+        A group's normals weigh faces by their angles (Thürmer & Wüthrich 1998), which do not
+        depend on how polygons were cut.
+        """
         normals = flat_normals(vertices, faces)
         groups = np.array([group[2] for group in self.face_groups])[owner]
         smooth = np.repeat(groups[:, None], 3, axis=1)
@@ -186,7 +192,8 @@ class _Reader:
             place = np.stack([smooth[at], faces[at]], axis=1)
             _, shared = np.unique(place, axis=0, return_inverse=True)
             sums = np.zeros((shared.max() + 1, 3))
-            np.add.at(sums, shared.ravel(), normals[at])
+            weighted = unit(normals) * _angles(vertices[faces])[..., None]
+            np.add.at(sums, shared.ravel(), weighted[at])
             normals[at] = sums[shared.ravel()]
         if (index >= 0).any():
             given = np.array(self.points["vn"])
@@ -216,6 +223,12 @@ class _Reader:
             raise UnreadableError(f"no mtllib has the material {name!r}")
         self.ignored.add("usemtl without any mtllib")
         return PLAIN
+
+
+def _angles(corners: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3"]:
+    """The angles of triangles, in radians."""
+    ahead, behind = (unit(np.roll(corners, step, axis=1) - corners) for step in (-1, 1))
+    return np.arccos(np.clip((ahead * behind).sum(axis=-1), -1, 1))
 
 
 def _plain(word: str) -> str:

@@ -65,8 +65,7 @@ class _Text:
         return self._typed(found, kind, count)
 
     def block(self, kinds: list[str], count: int) -> list[np.ndarray]:
-        found = self.numbers[self.at : self.at + count * len(kinds)].reshape(count, len(kinds))
-        self.at += found.size
+        found = self.take("f8", count * len(kinds)).reshape(count, len(kinds))
         return [self._typed(found[:, i], kind, count) for i, kind in enumerate(kinds)]
 
     def _typed(self, found: np.ndarray, kind: str, count: int) -> np.ndarray:
@@ -166,7 +165,11 @@ def _table(source: _Text | _Binary, element: _Element) -> _Rows:
     for name, kind in element.types.items():
         kinds += [element.counts[name]] if name in element.counts else []
         kinds += [kind] * first[name]
-    columns = iter(source.block(kinds, element.count))
+    try:
+        columns = iter(source.block(kinds, element.count))
+    except UnreadableError:  # lists of several lengths, or a fault that the other will name
+        source.at = start
+        return _uneven_table(source, element)
     found = {}
     for name in element.types:
         counted = next(columns) if name in element.counts else None

@@ -451,7 +451,7 @@ BROKEN = {
         lambda d: d["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"].update(
             texCoord=1
         ),
-        "TEXCOORD_2, which its mesh does not have",
+        "TEXCOORD_1, which its mesh does not have",
     ),
     "a mode that is none": (lambda d: d.update(mode=9), "of mode 9"),
 }
