@@ -101,7 +101,7 @@ class _Reader:
     def _drawn(self) -> list[int]:
         """The nodes of the file's scene: each before those below it."""
         scenes = take(self.document.json, "scenes", list, [])
-        if scenes:
+        if scenes or "scene" in self.document.json:
             chosen = self.document.item("scenes", take(self.document.json, "scene", int, 0))
             roots = take(chosen, "nodes", list, [])
         else:

@@ -124,6 +124,9 @@ class Document:
         """`rows` with those that a sparse accessor names."""
         count = take(sparse, "count", int)
         place, value = (take(sparse, key, dict) for key in ("indices", "values"))
+        for each in (place, value):
+            if "byteStride" in self.item("bufferViews", each.get("bufferView")):
+                raise UnreadableError("sparse values must lie side by side, without byteStride")
         where, what = (
             self._rows(
                 take(each, "bufferView", int),

@@ -7,20 +7,26 @@ from typing import Any
 
 import numpy as np
 
-from jaxfx.scene import _gltf, _obj, _ply, _trimesh
+from jaxfx.scene import _gltf, _obj, _off, _ply, _trimesh
 from jaxfx.scene._gltf_data import is_glb
 from jaxfx.scene._part import UnreadableError, assemble
 from jaxfx.scene._scene import Scene
 
 
 _logger = logging.getLogger("jaxfx.scene")
-_READERS = {".gltf": _gltf, ".glb": _gltf, ".obj": _obj, ".ply": _ply}
+_READERS = {
+    ".gltf": _gltf,
+    ".glb": _gltf,
+    ".obj": _obj,
+    ".ply": _ply,
+    ".off": _off,
+}
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
     """Read a mesh file, with its node transforms, textures and colours.
 
-    glTF, GLB, OBJ with MTL, and PLY are read here; STL, OFF and the rest by trimesh.
+    glTF, GLB, OBJ with MTL, PLY and OFF are read here; STL and the rest by trimesh.
     `docs/meshes.md` lists what of each format is honoured, refused and left out; what is left
     out of a file is also told to the logger `jaxfx.scene`, in one message. Images and the
     colours of OBJ and PLY files are taken to be sRGB; glTF's factors and vertex colours are
@@ -38,7 +44,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
 
     **Gradient:** none: this runs on the host.
 
-    Source: glTF 2.0 (Khronos 2017); Wavefront OBJ and MTL; PLY (Turk 1994).
+    Source: glTF 2.0 (Khronos 2017); Wavefront OBJ and MTL; PLY (Turk 1994); Geomview's OFF.
     """
     name = os.fspath(path)
     if not os.path.isfile(name):
