@@ -3,6 +3,7 @@
 Source: Wavefront's OBJ, as in Bourke 1995; colours after positions as MeshLab writes them.
 """
 
+import math
 import shlex
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
     text = data.decode("utf-8-sig", "surrogateescape").replace("\\\r\n", " ")
     for number, line in enumerate(text.replace("\\\n", " ").splitlines(), 1):
         try:
-            reader.line(line)
+            reader.line(line, number)
         except (UnreadableError, ValueError) as error:
             raise UnreadableError(f"line {number}, {line.strip()!r:.60}: {error}") from error
     return [reader.part()] if reader.sizes else [], reader.ignored | reader.library.ignored
@@ -43,30 +44,38 @@ class _Reader:
         self.missing: list[str] = []  # libraries that were not found
         self.names_libraries = False
         self.points: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
-        self.corners: list[tuple[int, int, int]] = []
+        self.corners: list[tuple[int, ...]] = []
         self.sizes: list[int] = []
+        self.face_lines: list[int] = []
         self.face_groups: list[tuple[str, str, int]] = []  # object, material, smoothing group
         self.object, self.group, self.material, self.smooth = "", "", "", 0
+        self._known: dict[str, tuple[int, ...]] = {}  # corners by how they are written
 
-    def line(self, line: str) -> None:
-        words = line.split("#", maxsplit=1)[0].split()
+    def line(self, line: str, number: int) -> None:
+        plain = line.split("#", maxsplit=1)[0] if "#" in line else line
+        words = plain.split()
         if not words:
             return
-        key, rest = words[0], line.strip()[len(words[0]) :].strip()
-        if key in self.points:
-            self._point(key, words[1:])
-        elif key in ("f", "fo"):
-            self._face(words[1:])
-        elif key == "usemtl":
+        key = words.pop(0)
+        if key in self.points or key in ("f", "fo"):
+            if "_" in plain:  # which Python takes for a separator of digits
+                raise UnreadableError("'_' is in no number")
+            if key in self.points:
+                self._point(key, words)
+            else:
+                self._face(words, number)
+            return
+        rest = line.strip()[len(key) :].strip()
+        if key == "usemtl":
             self.material = rest
         elif key == "mtllib":
             self._read_library(rest)
         elif key == "o":
             self.object = rest
         elif key == "g":
-            self.group = " ".join(words[1:])
+            self.group = " ".join(words)
         elif key == "s":
-            (group,) = words[1:]
+            (group,) = words
             self.smooth = 0 if group == "off" else int(group)
         elif key in _LEFT_OUT:
             self.ignored.add(_LEFT_OUT[key])
@@ -74,47 +83,50 @@ class _Reader:
             raise UnreadableError(f"{key!r} is not read")
 
     def _point(self, key: str, words: list[str]) -> None:
-        values = [float(_plain(word)) for word in words]
+        values = [float(word) for word in words]
         counts = {"v": (3, 4, 6, 7), "vt": (1, 2, 3), "vn": (3,)}[key]
         if len(values) not in counts:
             raise UnreadableError(f"{len(values)} numbers")
-        if key != "v" and not np.isfinite(values).all():
+        if key != "v" and not all(map(math.isfinite, values)):
             raise UnreadableError("a number is not finite")
-        if len(values) > 4 and not all(0 <= value <= 1 for value in values[-3:]):
+        if len(values) > 4 and not 0 <= min(values[-3:]) <= max(values[-3:]) <= 1:
             raise UnreadableError("a colour is not in [0, 1]")
         self.points[key].append(values)
 
-    def _face(self, words: list[str]) -> None:
+    def _face(self, words: list[str], number: int) -> None:
         if len(words) < 3:
             raise UnreadableError(f"a face of {len(words)} corners")
-        counts = [len(self.points[key]) for key in ("v", "vt", "vn")]
         for word in words:
-            indices = word.split("/")
-            if len(indices) > 3 or not indices[0]:
-                raise UnreadableError(f"{word!r} is no corner")
-            place = [-1, -1, -1]
-            for i, index in enumerate(indices):
-                if index:
-                    value = int(_plain(index))
-                    place[i] = value - 1 if value > 0 else counts[i] + value
-                    if value == 0 or place[i] < 0:
-                        raise UnreadableError(f"there is no {value} among {counts[i]}")
-            self.corners.append((place[0], place[1], place[2]))
-        forms = {tuple(i < 0 for i in corner) for corner in self.corners[-len(words) :]}
-        if len(forms) > 1:
-            raise UnreadableError("its corners are not of one form")
+            corner = self._known.get(word)
+            if corner is None:
+                corner = self._corner(word)
+                if "-" not in word:
+                    self._known[word] = corner
+            self.corners.append(corner)
         self.sizes.append(len(words))
+        self.face_lines.append(number)
         self.face_groups.append((self.object or self.group, self.material, self.smooth))
+
+    def _corner(self, word: str) -> tuple[int, ...]:
+        """The places of a corner's position, coordinates and normal; -1 for none."""
+        indices, found = word.split("/"), []
+        if len(indices) > 3 or not indices[0]:
+            raise UnreadableError(f"{word!r} is no corner")
+        for index, points in zip(indices, self.points.values(), strict=False):
+            value = int(index) if index else 0
+            place = value - 1 if value >= 0 else len(points) + value
+            if index and place < 0:
+                raise UnreadableError(f"there is no {value} among {len(points)}")
+            found.append(place)
+        return (*found, -1, -1)[:3]
 
     def _read_library(self, rest: str) -> None:
         """One file whose name has spaces, or several files."""
         self.names_libraries = True
-        whole = self._library(rest, rest.strip("\"'"))
-        parts = shlex.split(rest.replace("\\", "/"))
-        if whole is None and len(parts) > 1:
+        found = {rest: self._library(rest, rest.strip("\"'"))}
+        parts = [] if found[rest] else shlex.split(rest.replace("\\", "/"))
+        if len(parts) > 1:
             found = {name: self._library(name) for name in parts}
-        else:
-            found = {rest: whole}
         for name, path in found.items():
             if path is None:
                 self.missing.append(name)
@@ -129,10 +141,7 @@ class _Reader:
 
     def part(self) -> Part:
         corners = np.array(self.corners, np.intp)
-        for i, key in enumerate(self.points):
-            if corners[:, i].max() >= len(self.points[key]):
-                worst = corners[:, i].max() + 1
-                raise UnreadableError(f"a face has {key} {worst} of {len(self.points[key])}")
+        self._check(corners)
         vertices, colors = self._vertices()
         triangles, owner, crossing = triangulate(vertices[corners[:, 0]], self.sizes)
         if crossing:
@@ -154,6 +163,21 @@ class _Reader:
             None,
             None if colors is None else colors[faces],
         )
+
+    def _check(self, corners: Int[np.ndarray, "corner 3"]) -> None:
+        """Refuse corners that are not there, and faces whose corners are of several forms."""
+        owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
+        counts = np.array([len(points) for points in self.points.values()])
+        first = (np.cumsum(self.sizes) - self.sizes)[owner]
+        is_missing = np.less(corners, 0)
+        for wrong, reason in (
+            (corners >= counts, "it has an index that is too large"),
+            (is_missing != is_missing[first], "its corners are not of one form"),
+        ):
+            if wrong.any():
+                line = self.face_lines[owner[wrong.any(axis=1).argmax()]]
+                held = ", ".join(f"{len(points)} {key}" for key, points in self.points.items())
+                raise UnreadableError(f"line {line}, a face among {held}: {reason}")
 
     def _vertices(self) -> tuple[np.ndarray, np.ndarray | None]:
         rows = self.points["v"]
@@ -229,12 +253,6 @@ def _angles(corners: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3
     """The angles of triangles, in radians."""
     ahead, behind = (unit(np.roll(corners, step, axis=1) - corners) for step in (-1, 1))
     return np.arccos(np.clip((ahead * behind).sum(axis=-1), -1, 1))
-
-
-def _plain(word: str) -> str:
-    if "_" in word:  # which Python takes for a separator of digits
-        raise UnreadableError(f"{word!r} is no number")
-    return word
 
 
 def _numbered(values: list[str]) -> tuple[list[str], Int[np.ndarray, " value"]]:

@@ -23,7 +23,8 @@ def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
 
     if path.suffix.lower() in _ARCHIVES:
         raise UnreadableError("it is an archive: unpack it")
-    return list(parts(trimesh.load_scene(path, process=False), smooth=None)), set()
+    smooth = False if path.suffix.lower() == ".stl" else None  # which has no vertices' normals
+    return list(parts(trimesh.load_scene(path, process=False), smooth=smooth)), set()
 
 
 def parts(content: Any, *, smooth: bool | None) -> Iterator[Part]:

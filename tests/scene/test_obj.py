@@ -223,13 +223,17 @@ def test_materials_without_any_library(load, caplog):
 @pytest.mark.parametrize(
     ("text", "mtl", "complaint"),
     [
-        (f"{QUAD}f 1 2 5\n", "", r"a face has v 5 of 4"),
+        (f"{QUAD}f 1 2 5\n", "", r"line 9, a face among 4 v, 4 vt, 0 vn: it has an index that"),
         (f"{QUAD}f 1 2 -5\n", "", r"line 9, 'f 1 2 -5': there is no -5 among 4"),
         (f"{QUAD}f 1 2 0\n", "", r"line 9.*there is no 0"),
         (f"{QUAD}f 1 2\n", "", r"line 9.*a face of 2 corners"),
-        (f"{QUAD}f 1/1 2/2 3\n", "", r"line 9.*not of one form"),
-        (f"{QUAD}f 1/1/1 2/2/1 3/3/1\n", "", r"a face has vn 1 of 0"),
-        (f"{QUAD}f 1 2 1_0\n", "", r"line 9.*'1_0' is no number"),
+        (f"{QUAD}f 1/1 2/2 3\n", "", r"line 9, .*: its corners are not of one form"),
+        (
+            f"{QUAD}f 1/1/1 2/2/1 3/3/1\n",
+            "",
+            r"line 9, a face among 4 v, 4 vt, 0 vn: it has an index",
+        ),
+        (f"{QUAD}f 1 2 1_0\n", "", r"line 9.*'_' is in no number"),
         ("v 0 0\n", "", r"line 1, 'v 0 0': 2 numbers"),
         ("v 0 0 x\n", "", r"line 1, 'v 0 0 x'"),
         ("v 0 0 0 255 0 0\n", "", r"line 1.*a colour is not in \[0, 1\]"),
