@@ -1,7 +1,8 @@
 """Meshes to deep frame buffers and depth, on the host.
 
-glTF, OBJ, PLY and OFF are read here, other files by trimesh; OpenGL or Embree finds the face that
-every pixel shows; NumPy does the rest. World axes are the mesh file's own (y up in most of them); cameras are this package's.
+glTF, OBJ, PLY and OFF are read here, other files by trimesh; OpenGL or Embree finds the face
+that every pixel shows; NumPy does the rest. World axes are the mesh file's own (y up in most of
+them); cameras are this package's.
 """
 
 from jaxfx.scene._load import from_trimesh, load

@@ -61,7 +61,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
             f"`scene.load(path)` must be a mesh that can be read, got {name!r}: {reason}"
         ) from error
     if ignored:
-        _logger.warning("%r: left out are %s", name, ", ".join(sorted(ignored)))
+        _logger.warning("scene.load(%r): left out are %s", name, ", ".join(sorted(ignored)))
     with np.errstate(all="ignore"):
         return assemble(parts, f"scene.load({name!r})")
 

@@ -166,9 +166,10 @@ class _Reader:
 
     def _check(self, corners: Int[np.ndarray, "corner 3"]) -> None:
         """Refuse corners that are not there, and faces whose corners are of several forms."""
-        owner = np.repeat(np.arange(len(self.sizes)), self.sizes)
+        sizes = np.array(self.sizes)
+        owner = np.repeat(np.arange(len(sizes)), sizes)
         counts = np.array([len(points) for points in self.points.values()])
-        first = (np.cumsum(self.sizes) - self.sizes)[owner]
+        first = (np.cumsum(sizes) - sizes)[owner]
         is_missing = np.less(corners, 0)
         for wrong, reason in (
             (corners >= counts, "it has an index that is too large"),

@@ -92,7 +92,7 @@ def test_points_and_lines_are_left_out_and_said_so(gltf, caplog):
     with caplog.at_level(logging.WARNING, "jaxfx"):
         assert len(scene.load(path).faces) == 2
     assert [record.getMessage() for record in caplog.records] == [
-        f"{str(path)!r}: left out are points and lines"
+        f"scene.load({str(path)!r}): left out are points and lines"
     ]
 
 
