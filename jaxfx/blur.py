@@ -91,9 +91,9 @@ def gaussian(
     linear sampling after Rakos 2010, efficient Gaussian blur with linear sampling.
     """
     image = check_image("gaussian(image)", image)
+    # An even kernel lies between pixels: `downsample` has it.
+    is_odd = lambda n: n >= 1 and n % 2 == 1
     if taps is not None:
-        # An even kernel lies between pixels: `downsample` has it.
-        is_odd = lambda n: n >= 1 and n % 2 == 1
         taps = whole_number("gaussian(taps=...)", taps, is_odd, "an odd positive integer")
     passes = whole_number("gaussian(passes=...)", passes)
     option("gaussian(sampling=...)", sampling, get_args(Sampling))

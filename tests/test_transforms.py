@@ -175,6 +175,13 @@ EXAMPLES = {
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "behind": [lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size))],
+    "disparity": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "distance": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "scale": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "shift": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "focal_pixels": [lambda rng, size: np.array(rng.uniform(20, 30))],
+    "baseline": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "softness": [lambda rng, size: np.array(rng.uniform(1, 2))],
 }
 

@@ -131,12 +131,9 @@ def shadow(
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    checked = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)
-    is_left_out = bias is None and slope_bias is None
-    biases = (None, None) if is_left_out else (checked[2], checked[3])
-    # As given, the slope too: a bias that is left out is found anew for other receivers.
-    slope = parameter("shadow(receivers.slope)", receivers.slope, None)
-    shadow_map, receivers, size = checked[0], checked[1]._replace(slope=slope), int(size)
+    shadow_map = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)[0]
+    given = lambda name, each: None if each is None else parameter(f"shadow({name}=...)", each)
+    biases, size = (given("bias", bias), given("slope_bias", slope_bias)), int(size)
     where = candidates(
         shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1]
     ).where

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -100,6 +101,16 @@ def read_map(depth: Any) -> tuple[Array, Array, Any]:
     working = working_dtype(depth.dtype)
     height, width = depth.shape
     return pixel_centers(height, width, working), depth.astype(working), depth.dtype
+
+
+def at_origin(camera: Any) -> Any:
+    """A camera of either kind, turned as it is, at the world's origin.
+
+    For what does not depend on where it stands: a difference of two points far away from the
+    origin would have few digits left.
+    """
+    pose = camera.world_from_camera.at[:3, 3].set(0)
+    return eqx.tree_at(lambda camera: camera.world_from_camera, camera, pose)
 
 
 def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:

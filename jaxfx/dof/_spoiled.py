@@ -1,4 +1,4 @@
-"""What the pixels spoil that are no picture: all that their sprites reach."""
+"""Pixels that a colour which is no number spoils: all that its sprite reaches."""
 
 import jax
 import jax.numpy as jnp
@@ -10,25 +10,23 @@ from jaxfx.dof._tiles import sum_all
 
 
 def spoiled(
-    bad: Bool[Array, "height width"],
-    coc: Float[Array, "height width"],
-    max_coc: int | float,
+    bad: Bool[Array, "height width"], coc: Float[Array, "height width"], max_coc: int | float
 ) -> Bool[Array, "height width"]:
-    """Where the sprites of the `bad` pixels reach, of a circle that is not known the largest.
+    """Where the sprites of the `bad` pixels reach, `max_coc` where a circle is not known.
 
     If there are none, nothing is computed; in a batch, for no image that has none.
     """
     diameter = jnp.where(coc < max_coc, jnp.maximum(coc, 2 * POINT_RADIUS), max_coc)
-    # What the other pixels reach costs nothing then.
+    # The other pixels reach only themselves: the kernels then skip them.
     radius = jax.lax.stop_gradient(jnp.where(bad, diameter / 2, POINT_RADIUS))
 
     # One by one: under `vmap` a `cond` by itself becomes a `select`, and computes both sides.
     @sequential_vmap
-    def found(bad, radius):
+    def reached(bad, radius):
         return jax.lax.cond(bad.any(), cover, lambda bad, _: bad, bad, radius)
 
     def cover(bad, radius):
         value = bad[..., None].astype(radius.dtype)
         return sum_all(value, radius, reach(max_coc))[..., 0] > 0
 
-    return found(bad, radius)
+    return reached(bad, radius)

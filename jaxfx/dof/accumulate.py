@@ -21,7 +21,8 @@ class Accumulation(NamedTuple):
 
     - `image`: height width channel, the mean of all passes, linear radiance.
     - `convergence`: the root-mean-square difference between the mean of the first half of the
-      passes and the mean of all, in units of radiance; NaN for a single pass.
+      passes and the mean of all, over the pixels that are finite, in units of radiance; NaN for
+      a single pass.
     """
 
     image: Float[Array, "height width channel"]
@@ -98,7 +99,14 @@ def accumulate(
     mean = total / samples
     if half is None:
         return Accumulation(mean.astype(dtype), jnp.asarray(jnp.nan, mean.dtype))
-    return Accumulation(mean.astype(dtype), safe_sqrt(jnp.mean((half - mean) ** 2)))
+    return Accumulation(mean.astype(dtype), _root_mean_square(half - mean))
+
+
+def _root_mean_square(difference: Float[Array, "..."]) -> Float[Array, ""]:
+    """Of the numbers that are finite; NaN where none is."""
+    finite = jnp.isfinite(difference)
+    squares = jnp.where(finite, difference, 0) ** 2
+    return safe_sqrt(jnp.sum(squares) / jnp.sum(finite, dtype=squares.dtype))
 
 
 def lens_samples(

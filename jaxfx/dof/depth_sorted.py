@@ -94,7 +94,7 @@ def _depth_sorted(image, depth, lens, max_coc, slices):
     sums = with_own(sums, image, missing)
     result = sums[..., :-1] / sums[..., -1:]
 
-    spoils = spoiled(bad, coc, max_coc) | lost
+    spoils = spoiled(bad, jnp.abs(defocus), max_coc) | lost
     return jnp.where(spoils[..., None], jnp.nan, result).astype(dtype)
 
 

@@ -1,4 +1,4 @@
-"""Pictures and deep frame buffers in OpenEXR files.
+"""Images, their depth and deep frame buffers in OpenEXR files.
 
 The file boundary, on the host: NumPy in and out. An EXR file holds linear numbers and keeps
 them to the bit; `jaxfx.io` has the formats for screens.
@@ -29,11 +29,13 @@ any case and after any dot: `left.Normal`.
 
 from jaxfx.exr.frame import read_gbuffer, write_gbuffer
 from jaxfx.exr.layers import read, write
+from jaxfx.exr.rgbd import read_rgbd
 
 
 __all__ = [
     "read",
     "read_gbuffer",
+    "read_rgbd",
     "write",
     "write_gbuffer",
 ]

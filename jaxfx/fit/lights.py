@@ -101,7 +101,8 @@ def lights(
     **Arguments:**
 
     - `reference`: height width 3, linear radiance.
-    - `gbuffer`, `camera`: as in `relight.shade`.
+    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing (0, negative, NaN)
+      a pixel has no say.
     - `lights`: their number and kinds, and where the search starts; colours count only if they
       are not fitted.
     - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
@@ -130,7 +131,7 @@ def lights(
     """
     gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
     check_camera("lights(camera)", camera)
-    reference = _reference(reference, gbuffer)
+    reference, gbuffer = _known(_reference(reference, gbuffer), gbuffer)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
     rounds = whole_number("lights(rounds=...)", rounds)
@@ -174,6 +175,14 @@ def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
         )
     check("lights(reference)", reference, np.isfinite, "finite")
     return reference.astype(gbuffer.color.dtype)
+
+
+def _known(reference: Array, gbuffer: GBuffer) -> tuple[Array, GBuffer]:
+    """Both black where the depth is missing: such a pixel has no say."""
+    missing = ~(gbuffer.depth > 0)
+    shader = jnp.where(missing, -1, gbuffer.shader)
+    gbuffer = eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
+    return jnp.where(missing[..., None], 0, reference), gbuffer
 
 
 def _start(lights: Any) -> tuple[Light, ...]:

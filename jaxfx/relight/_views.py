@@ -77,7 +77,7 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     take = lambda field: read(field, index)
     shader, cached = take(gbuffer.shader), take(gbuffer.depth).astype(dtype)
     normal = take(gbuffer.normal).astype(dtype)
-    filled = inside & (shader >= 0) & jnp.isfinite(cached)
+    filled = inside & (shader >= 0) & (cached > 0) & jnp.isfinite(cached)
     cached = jnp.where(filled, cached, 1)
 
     centre = jnp.stack([index % width, index // width], axis=-1).astype(dtype) + 0.5
@@ -89,7 +89,8 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     seen &= _dot(normal, points.to_camera) > _AWAY
 
     to_camera = normalize(camera.unproject(centre, jnp.zeros_like(cached)) - points.position)
-    frontal = jnp.maximum(_dot(normal, to_camera), 0.01)
+    # A cache's normal may be no number where it does not see the point.
+    frontal = jnp.maximum(_dot(jnp.where(seen[..., None], normal, 0), to_camera), 0.01)
     detail = frontal * _pixels_per_area(camera, jnp.where(filled, depth, 1))
     return Found(seen, index, shader, normal, distance, detail)
 

@@ -21,7 +21,12 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight._sums import Sums, changed, image as shaded, nothing
-from jaxfx.relight.shading import Surface, checked, exponent, to_surface
+from jaxfx.relight.shading import (
+    Surface,
+    checked,
+    exponent,
+    to_surface,
+)
 
 
 _Image = Float[Array, "height width 3"]

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfx.scene._scene import Material, Scene, Viewpoint
+from jaxfx.scene._material import Material
+from jaxfx.scene._scene import Scene, Viewpoint
 
 
 _Corners = Float[np.ndarray, "face 3 3"]

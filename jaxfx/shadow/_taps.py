@@ -136,11 +136,11 @@ def common_dtype(shadow_map: Array, receivers: Receivers) -> jnp.dtype:
 def pad_map(
     shadow_map: Float[Array, "rows columns"], size: int, dtype: Any
 ) -> Float[Array, "texels_down texels_across"]:
-    """The map with `size` texels that are infinitely far all around; NaN is infinitely far.
+    """The map with `size` texels that are infinitely far all around, as what is missing is.
 
     A few more on the right are there to be read, not compared, by vector units.
     """
-    known = jnp.where(jnp.isnan(shadow_map), jnp.inf, shadow_map).astype(dtype)
+    known = jnp.where(shadow_map > 0, shadow_map, jnp.inf).astype(dtype)
     widths = ((size, size), (size, size + LANES - 1))
     return jnp.pad(known, widths, constant_values=jnp.inf)
 
@@ -155,8 +155,11 @@ def find_places(
 ) -> Places:
     """The receivers in a map of `shape` that `pad_map` padded for filters of `size`."""
     u, v, z, slope = (field.astype(dtype) for field in receivers)
+    # One slope that is no number would make the derivative in the slope bias none.
+    known = (z > 0) & jnp.isfinite(slope)
+    slope = jnp.where(known, slope, 0)
     threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
-    threshold = jnp.where((z > 0) & (threshold < jnp.inf), threshold, -jnp.inf)
+    threshold = jnp.where(known & (threshold < jnp.inf), threshold, -jnp.inf)
 
     # A NaN is on neither side of anything, and goes outside of the map.
     reach = size // 2

@@ -32,7 +32,7 @@ def hard(
 
     A receiver is in shadow where the texel that holds it is nearer to the light than
     `z - bias - slope_bias * slope`, and lit otherwise: at equality, outside the map, behind
-    the light, and where the texel is inf or not a number.
+    the light, and where the texel is inf or missing (0, negative, NaN).
 
     **Arguments:**
 

@@ -82,7 +82,7 @@ def _pcss(shadow_map, receivers, camera, bias, slope_bias, softness, light_size,
 
     count, total = _taps.sum_rows(blockers, size)
     mean = safe_divide(total, count)
-    z = receivers.z.astype(dtype)
+    z = jnp.where(places.threshold > -jnp.inf, receivers.z.astype(dtype), 1)
     width = _penumbra(camera, light_size.astype(dtype), z, mean)
     width = jnp.where((count > 0) & (mean > 0), width, 0)
     half = jnp.clip(width / 2, 0.5, max(size // 2, 0.5))

@@ -34,8 +34,8 @@ def variance(
 
     **Arguments:**
 
-    - `shadow_map`, `receivers`: height width, as in `hard`. An inf counts as the farthest depth
-      of map and receivers.
+    - `shadow_map`, `receivers`: height width, as in `hard`. An inf, or what is missing, counts
+      as the farthest depth of map and receivers.
     - `size`: static; odd, in texels.
     - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, what
       rounding takes: a plane's mean depth, read between texels, is the plane's.
@@ -63,14 +63,18 @@ def variance(
 def _variance(shadow_map, receivers, bias, slope_bias, least, size):
     dtype = _taps.common_dtype(shadow_map, receivers)
     z = receivers.z.astype(dtype)
-    threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * receivers.slope)
+    slope = receivers.slope.astype(dtype)
     points = jnp.stack([receivers.u, receivers.v], axis=-1).astype(dtype)
-    known = jnp.isfinite(points).all(axis=-1) & jnp.isfinite(threshold) & (z > 0)
+    known = jnp.isfinite(points).all(axis=-1) & jnp.isfinite(z) & jnp.isfinite(slope) & (z > 0)
+    z, slope = (jnp.where(known, each, 0) for each in (z, slope))
+    threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
+    known &= jnp.isfinite(threshold)
     threshold = jnp.where(known, threshold, 0)
 
-    near, far = _range(shadow_map.astype(dtype), threshold, known)
+    shadow_map = jnp.where(shadow_map > 0, shadow_map.astype(dtype), jnp.inf)
+    near, far = _range(shadow_map, threshold, known)
     scale = jnp.where(far > near, far - near, 1)
-    depth = jnp.where(jnp.isfinite(shadow_map), shadow_map.astype(dtype), far)
+    depth = jnp.where(shadow_map < jnp.inf, shadow_map, far)
     depth = jnp.pad((depth - near) / scale, size + 1, constant_values=(far - near) / scale)
     moments = _mean(jnp.stack([depth, depth * depth], axis=-1), size)
 

@@ -258,7 +258,7 @@ def test_no_byte_can_change_unnoticed(tmp_path, value):
     for at in [*range(chunks), *range(chunks, len(data), 37), len(data) - 1]:
         data[at] ^= value
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=r"a\.exr` (must be an OpenEXR file|is damaged: )"):
+        with pytest.raises(ValueError, match=r"a\.exr` (must be an OpenEXR file|is damaged)"):
             exr.read_gbuffer(path)
         data[at] ^= value
     path.write_bytes(data)
@@ -271,7 +271,7 @@ def test_no_cut_goes_unnoticed(tmp_path):
     data = path.read_bytes()
     for end in range(len(data)):
         path.write_bytes(data[:end])
-        with pytest.raises(ValueError, match=r"a\.exr` (must be an OpenEXR file|is damaged: )"):
+        with pytest.raises(ValueError, match=r"a\.exr` (must be an OpenEXR file|is damaged)"):
             exr.read_gbuffer(path)
     path.write_bytes(data + b"\0")
     with pytest.raises(ValueError, match=r"a\.exr` is damaged: "):
