@@ -144,8 +144,7 @@ def dof(
     max_steps = whole_number("dof(max_steps=...)", max_steps)
     if max_coc is not None:
         max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
-    if {"aperture", "focus_distance"} & set(unknowns):
-        _check_that_it_moves(lens, depth, behind, max_coc)
+    _check_moves(unknowns, lens, depth, behind, max_coc)
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
     with Bar(progress, "fit") as bar:
         solve = lambda model, y: descend(

@@ -120,9 +120,8 @@ def lights(
     **Returns:** a `LightsFit`.
 
     **Raises:** `ValueError` for what `relight.shade` refuses, for shapes or numbers of entries
-    that differ, for parameters that no light has, for a reference that is not finite, or where
-    nothing that is fitted changes the image at the start. `RuntimeError` where the last round
-    fails and `throw` is true.
+    that differ, parameters that no light has, a reference that is not finite, or a start where
+    nothing changes the image. `RuntimeError` where the last round fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
 

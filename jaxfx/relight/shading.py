@@ -113,8 +113,8 @@ def render(
     lights = check_lights("render(lights)", lights)
     gbuffer = checked("render", gbuffer, camera)
     name, shape = "render(visibilities=...)", gbuffer.depth.shape
-    visibilities = shares(name, visibilities, len(lights), shape)
-    return _render(gbuffer, camera, lights, tuple(visibilities))
+    visible = tuple(shares(name, visibilities, len(lights), shape))
+    return _render(gbuffer, camera, lights, visible)
 
 
 class Surface(NamedTuple):

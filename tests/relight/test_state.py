@@ -206,7 +206,9 @@ def test_a_light_that_is_not_finite_leaves_no_trace(bad):
     """Not even when others were edited in between; meanwhile it shows where it reaches."""
     lights = make_lights(3, kinds=(point,))
     state = relight.start(SINGLE, CAMERA, lights)
-    spoiled = state.edit(1, PointLight([0, 0, 0], [bad, 1, 1]))
+    # Made traced, where its numbers can't be looked at.
+    glaring = jax.jit(lambda color: PointLight(jnp.zeros(3), color))(jnp.array([bad, 1, 1]))
+    spoiled = state.edit(1, glaring)
     assert not np.isfinite(spoiled.image).all()
     assert not np.isnan(np.asarray(spoiled.image)[np.asarray(SINGLE.shader) < 0]).any()
     after = spoiled.edit(0, lights[2]).edit(1, lights[1]).edit(0, lights[0])

@@ -127,8 +127,13 @@ def test_other_faults_name_their_argument(case):
         with pytest.raises(ValueError) as caught:
             pcf(*data, size=3, **options)
         assert str(caught.value).startswith(f"`pcf({name})`")
-    with pytest.raises(ValueError, match="must hold floats"):
-        pcf(np.ones((3, 3), int), receivers, size=3)
+
+
+def test_an_integer_map_is_read_as_depths():
+    _, receivers = noise()
+    whole = np.random.default_rng(1).integers(1, 4, (14, 17))
+    found, expected = (shadow.pcf(m, receivers, size=3) for m in (whole, whole.astype(float)))
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
