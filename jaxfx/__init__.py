@@ -4,8 +4,9 @@ An image and its depth, or a deep frame buffer, go in; images come out, with tru
 
 The types live here. The effects are the modules `blur`, `dof`, `reproject`, `shadow` and
 `relight`; `fit`, `budget`, `metrics` and `tradeoff` work on top of them; `depth` reads depth as
-cameras, networks and files give it; `scene`, `exr` and `io` read and write files on the host. A module is loaded when it is first used, so
-`import jaxfx; jaxfx.dof.scatter` works and nothing is loaded in vain.
+cameras, networks and files give it; `scene`, `exr` and `io` read and write files on the host.
+A module is loaded when it is first used, so `import jaxfx; jaxfx.dof.scatter` works and nothing
+is loaded in vain.
 """
 
 import importlib

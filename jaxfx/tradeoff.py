@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfx import metrics
+from jaxfx._extras import needs
 from jaxfx._files import StrPath, write_whole
 from jaxfx._progress import counted
 
@@ -253,7 +254,8 @@ def plot(
 
 def _scale(ax: "Axes", costs: Sequence[float]) -> None:
     """Logarithmic, or linear below the smallest if there is a 0; with plain numbers."""
-    from matplotlib.ticker import LogLocator
+    with needs("plot"):
+        from matplotlib.ticker import LogLocator
 
     if 0 in costs:
         least = min((x for x in costs if x > 0), default=1.0)
@@ -353,7 +355,8 @@ def save(figure: "Figure", path: StrPath) -> None:
 
     **Gradient:** none: it writes a file.
     """
-    import matplotlib
+    with needs("plot"):
+        import matplotlib
 
     kind = Path(path).suffix.removeprefix(".")
     known = figure.canvas.get_supported_filetypes()

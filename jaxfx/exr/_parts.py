@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfx._extras import needs
 from jaxfx._files import StrPath
 from jaxfx.exr import _seal
 
@@ -75,7 +76,8 @@ def read_parts(path: StrPath, max_pixels: int, verify: bool) -> list[Part]:
 
 
 def _open(path: StrPath, data: bytes, *, header_only: bool) -> list[Any]:
-    import OpenEXR
+    with needs("io"):
+        import OpenEXR
 
     options = {"separate_channels": True, "header_only": header_only}
     try:
@@ -86,7 +88,8 @@ def _open(path: StrPath, data: bytes, *, header_only: bool) -> list[Any]:
 
 def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[int, int]:
     """Height and width of a part that can be read; `ValueError` otherwise."""
-    import OpenEXR
+    with needs("io"):
+        import OpenEXR
 
     (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
     height, width = bottom - top + 1, right - left + 1

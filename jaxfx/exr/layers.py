@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.exr import _seal
 from jaxfx.exr._parts import CHUNK, MAX_PIXELS, full_names, planes_of, read_parts
@@ -86,7 +87,8 @@ def write_planes(
     path: StrPath, channels: Mapping[str, Any], attributes: Mapping[str, Any]
 ) -> None:
     """Write `channels`, and `attributes` into the header."""
-    import OpenEXR
+    with needs("io"):
+        import OpenEXR
 
     planes = _planes(channels)
     height = next(iter(planes.values())).shape[0]

@@ -44,6 +44,15 @@ class End(NamedTuple):
     losses: list[Float[Array, ""]]
     result: optx.RESULTS
 
+    def check(self, function: str, sought: str) -> None:
+        """Raise `RuntimeError` where the solver failed."""
+        if self.result != optx.RESULTS.successful:
+            raise RuntimeError(
+                f"`{function}` found no {sought} in {len(self.losses)} steps, the mean squared "
+                f"residual going from {self.losses[0]:.3g} to {self.losses[-1]:.3g}: "
+                f"{self.result} `throw=False` returns what was reached."
+            )
+
 
 def descend(
     residual: Callable[[Any], Float[Array, "..."]],

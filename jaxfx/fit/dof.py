@@ -151,13 +151,8 @@ def dof(
             _Residual(model, reference), y, solver=solver, max_steps=max_steps, bar=bar
         )
         model, end = _search(model, unknowns, solve)
-    if throw and end.result != optx.RESULTS.successful:
-        raise RuntimeError(
-            f"`dof` found no fit in {len(end.losses)} steps, the mean squared residual going "
-            f"from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {end.result} "
-            "`throw=False` returns what was reached."
-        )
-
+    if throw:
+        end.check("dof", "lens")
     found = _constrain(end.unknowns, image.dtype)
     values = start | found
     fitted = _drawn(model, found)

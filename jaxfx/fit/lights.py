@@ -143,14 +143,9 @@ def lights(
             visibility,
             lambda model, lights: _search(model, lights, reference, solver, max_steps, bar),
         )
+    if throw:
+        end.check("lights", "lights")
     found, losses = end.unknowns, end.losses
-    if throw and end.result != optx.RESULTS.successful:
-        raise RuntimeError(
-            f"`lights` found no fit in {len(losses)} steps, the mean squared residual going "
-            f"from {losses[0]:.3g} to {losses[-1]:.3g}: {end.result} "
-            "`throw=False` returns what was reached."
-        )
-
     image, columns = _linearized(model, found)
     errors = standard_errors(columns, image - reference)
     owners = [i for i, each in enumerate(map(model.values, found)) for _ in _flat(each)]

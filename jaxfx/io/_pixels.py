@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfx._extras import needs
 from jaxfx._files import StrPath
 
 
@@ -16,7 +17,8 @@ _SRGB = (b"sRGB", "sRGB".encode("utf-16-be"))
 
 def png_values(data: bytes) -> np.ndarray:
     """The numbers of a PNG file, height width channel, over their largest."""
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
     def pixels(layout: str = "") -> np.ndarray:
         picture: Any = Image.open(io.BytesIO(data), formats=("PNG",))
@@ -54,7 +56,8 @@ def jpeg_values(data: bytes) -> np.ndarray:
 
     As stored: where the file says how to turn it upright, that is left to the caller.
     """
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
     picture = Image.open(io.BytesIO(data), formats=("JPEG",))
     if picture.mode not in ("L", "RGB"):

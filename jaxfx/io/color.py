@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfx import exr
+from jaxfx._extras import needs
 from jaxfx._files import StrPath
 from jaxfx.exr.rgbd import choose, images_of
 from jaxfx.io._pixels import jpeg_values, log_profile
@@ -65,7 +66,8 @@ def read_color(
 
 
 def _decode_jpeg(path: StrPath, data: bytes) -> np.ndarray:
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
     try:
         values = jpeg_values(data)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Num
 
 from jaxfx import exr
+from jaxfx._extras import needs
 from jaxfx._files import StrPath
 from jaxfx.exr.rgbd import choose, depths_of, flat
 from jaxfx.io.color import EXR, JPEG, PNG
@@ -92,7 +93,8 @@ def _from_exr(path: StrPath, layer: str | None) -> np.ndarray:
 
 
 def _from_png(path: StrPath, data: bytes) -> np.ndarray:
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
     try:
         picture = Image.open(BytesIO(data), formats=("PNG",))

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from jaxfx._checks import as_numpy
+from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.io._pixels import log_profile, png_values
 
@@ -83,7 +84,8 @@ def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) ->
 
     **Gradient:** none; the host side.
     """
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
     check_suffix("write_png(path)", path, ".png")
     array = np.asarray(image)
@@ -122,7 +124,8 @@ def read_png(path: StrPath) -> Float[np.ndarray, "height width channel"]:
 
 def decode_png(path: StrPath, data: bytes) -> np.ndarray:
     """The image of a PNG file; `path` is for errors."""
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
     try:
         values = png_values(data)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
+from jaxfx._extras import needs
 from jaxfx.io._pixels import jpeg_values, png_values
 from jaxfx.scene._part import UnreadableError
 
@@ -83,7 +84,8 @@ def _three(codes: np.ndarray) -> _Texture:
 
 
 def _by_pillow(data: bytes, name: str) -> _Texture:
-    from PIL import Image
+    with needs("scene"):
+        from PIL import Image
 
     kinds = [kind for start, kind in _OTHERS.items() if data.startswith(start)]
     if not kinds and name.lower().endswith(".tga"):  # TGA files have no sign of their own

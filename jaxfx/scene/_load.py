@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfx._extras import needs
 from jaxfx.scene import _gltf, _obj, _off, _ply, _trimesh
 from jaxfx.scene._gltf_data import is_glb
 from jaxfx.scene._part import UnreadableError, assemble
@@ -85,7 +86,8 @@ def from_trimesh(mesh: Any, *, smooth: bool | None = None) -> Scene:
 
     **Gradient:** none: this runs on the host.
     """
-    import trimesh
+    with needs("scene"):
+        import trimesh
 
     if isinstance(mesh, trimesh.Trimesh):
         mesh = trimesh.Scene(mesh)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfx._extras import needs
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
 
@@ -119,9 +120,10 @@ class _Rasterizer:
     """A context, a program, and the buffers of the scene and size drawn last."""
 
     def __init__(self):
-        import pyrender
-        from OpenGL import GL
-        from OpenGL.GL import shaders
+        with needs("scene"):
+            import pyrender
+            from OpenGL import GL
+            from OpenGL.GL import shaders
 
         self.gl = GL
         self.context = pyrender.OffscreenRenderer(1, 1)

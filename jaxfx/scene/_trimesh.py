@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfx._extras import needs
 from jaxfx.io import linear_from_srgb
 from jaxfx.scene._images import pillow_codes
 from jaxfx.scene._material import Material
@@ -19,7 +20,8 @@ _ARCHIVES = (".zip", ".gz", ".bz2", ".xz", ".tar", ".tgz")
 
 def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
     """The parts of a file that trimesh reads."""
-    import trimesh
+    with needs("scene"):
+        import trimesh
 
     if path.suffix.lower() in _ARCHIVES:
         raise UnreadableError("it is an archive: unpack it")
@@ -29,7 +31,8 @@ def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
 
 def parts(content: Any, *, smooth: bool | None) -> Iterator[Part]:
     """Every instance of a triangle mesh; points and curves are passed over."""
-    import trimesh
+    with needs("scene"):
+        import trimesh
 
     for node in content.graph.nodes_geometry:
         transform, key = content.graph[node]
@@ -62,7 +65,8 @@ def _normals(mesh: Any, smooth: bool | None) -> Float[np.ndarray, "face 3 3"] | 
     trimesh keeps given normals and those it made itself in one place. Given ones are told by
     not being what it makes of the same faces.
     """
-    import trimesh
+    with needs("scene"):
+        import trimesh
 
     if smooth is False:
         return None
@@ -129,7 +133,8 @@ def _unit_rgb(colors: Any) -> Float[np.ndarray, "*any 3"]:
 
 def _materials(mesh: Any) -> tuple[list[Material], Int[np.ndarray, " face"]]:
     """The mesh's materials, and every face's index into them."""
-    from trimesh.visual.material import MultiMaterial
+    with needs("scene"):
+        from trimesh.visual.material import MultiMaterial
 
     index = np.zeros(len(mesh.faces), np.int64)
     material = getattr(mesh.visual, "material", None)
@@ -143,7 +148,8 @@ def _materials(mesh: Any) -> tuple[list[Material], Int[np.ndarray, " face"]]:
 
 
 def _material(mesh: Any, material: Any) -> Material:
-    from trimesh.visual.material import PBRMaterial
+    with needs("scene"):
+        from trimesh.visual.material import PBRMaterial
 
     has_uv = getattr(mesh.visual, "uv", None) is not None
     if isinstance(material, PBRMaterial):
@@ -180,7 +186,8 @@ def _simple(material: Any, has_uv: bool) -> Material:
 
 def _is_default(color: Any) -> bool:
     """Whether trimesh filled this in for a material that says nothing."""
-    from trimesh.visual.color import DEFAULT_COLOR
+    with needs("scene"):
+        from trimesh.visual.color import DEFAULT_COLOR
 
     return color is None or np.array_equal(color, DEFAULT_COLOR)
 

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.helpers.quick import quick_jit
 
 from jaxfx import OrthographicCamera, PinholeCamera
 from jaxfx.reproject import blend, choose, intersect, warp
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")
