@@ -16,7 +16,7 @@ from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
 from jaxfx.budget._tiles import Blocks, allowed, blocks, spend, sums, tile_of
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.reproject.blend import Sight, blend
+from jaxfx.reproject.blend import Sight, blend, check_sources
 
 
 _OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
@@ -103,7 +103,8 @@ def reproject(
 
     **Gradient:** none through the choice; the plan's picture has that of what it draws.
     """
-    data = (images, depths, sources, target)
+    data = check_sources("reproject", images, depths, sources, target)
+    images, depths, sources, _ = data
     max_error = check_call("reproject", max_error, data)
     search = Search(Everything(shape), data, max_error)
     height, width = search.whole[1].shape[:2]

@@ -69,13 +69,12 @@ def blend(
     Source: the several references that Kim, Ki, Lee & Oh name as future work; the weights are
     our own.
     """
-    _check_lists("blend", images=images, depths=depths, sources=sources)
-    images = [check_image("blend(images)", image) for image in images]
+    given = check_sources("blend", images, depths, sources, target)
+    images, depths, sources, target = given
     size = check_options("blend", shape or images[0].shape[:2], method, hole_threshold)
-    depths = _checked("blend", depths, [image.shape[:2] for image in images], sources, target)
     options = {"method": method, "hole_threshold": float(hole_threshold)}
     seen = Sight(target, pixel_centers(*size).reshape(-1, 2), options)
-    return _blended(seen, images, depths, list(sources), size)
+    return _blended(seen, images, depths, sources, size)
 
 
 @eqx.filter_jit
@@ -162,6 +161,16 @@ def _chosen(seen: "Sight", depths: list, sources: list, count: int) -> Choice:
         chosen.append(index.astype(jnp.int32))
         reached.append(jnp.mean(best))
     return Choice(jnp.stack(chosen), jnp.stack(reached))
+
+
+def check_sources(
+    caller: str, images: Any, depths: Any, sources: Any, target: Any
+) -> tuple[list[Array], list[Array], list[PinholeCamera], Camera]:
+    """Pictures, depths and cameras, as lists; `ValueError` names a fault."""
+    _check_lists(caller, images=images, depths=depths, sources=sources)
+    images = [check_image(f"{caller}(images)", image) for image in images]
+    depths = _checked(caller, depths, [image.shape[:2] for image in images], sources, target)
+    return images, depths, list(sources), target
 
 
 def _check_lists(caller: str, **lists: Any) -> None:
