@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxfx._checks import Number
+from jaxfx._checks import Number, check_image, parameter
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
@@ -128,9 +128,9 @@ def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> 
     """The sources of all parts, with their blocks. A program does not know which they are."""
 
     def source(index: int) -> tuple[Array, Array, PinholeCamera]:
-        depth = jnp.asarray(depths[index])
+        depth = parameter("reproject(depths)", depths[index], None)
         return (
-            jnp.asarray(images[index]),
+            check_image("reproject(images)", images[index]),
             depth.astype(working_dtype(depth.dtype)),
             sources[index],
         )
