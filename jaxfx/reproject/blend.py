@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._checks import Number, WholeNumber, check_image, items, whole_number
+from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
@@ -136,11 +136,12 @@ def choose(
     most = len(sources)
     is_valid = lambda n: 1 <= n <= most
     count = whole_number("choose(count=...)", count, is_valid, f"an integer from 1 to {most}")
-    size = shape or jnp.shape(depths[0])[:2]
+    depths = [check_map("choose(depths)", depth) for depth in depths]
+    size = shape or depths[0].shape
     height, width = check_options("choose", size, "pyramid", hole_threshold)
     rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in (height, width))
     pixels = pixel_centers(height, width)[rows, columns].reshape(-1, 2)
-    depths = _checked("choose", depths, list(map(jnp.shape, depths)), sources, target)
+    depths = _checked("choose", depths, [depth.shape for depth in depths], sources, target)
     options = {"method": "pyramid", "hole_threshold": float(hole_threshold)}
     return _chosen(Sight(target, pixels, options), depths, list(sources), count)
 
