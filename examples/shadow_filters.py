@@ -26,7 +26,6 @@ from tqdm.auto import tqdm
 
 from jaxfx import AmbientLight, DirectionalLight, io, relight, scene, shadow
 from jaxfx._files import write_whole
-from jaxfx._sampling import pixel_centers
 
 
 matplotlib.use("Agg")
@@ -95,7 +94,7 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
     # The map takes in what is seen, and what lies as far again towards the light.
     seen = np.isfinite(gbuffer.depth)
     depth = jnp.where(seen, gbuffer.depth, 1)
-    points = np.asarray(camera.unproject(pixel_centers(size, size, depth.dtype), depth))[seen]
+    points = np.asarray(camera.points(depth))[seen]
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=-1).max())
     (light_camera,) = shadow.light_cameras(key, map_size=map_size, centre=centre, radius=radius)

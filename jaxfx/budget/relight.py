@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_lights
-from jaxfx._checks import Number, shares
+from jaxfx._checks import Number, as_array, shares
 from jaxfx._numerics import working_dtype
 from jaxfx.budget._plan import Part, Plan, Search, Trial, check_call
 from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of, tile_sums
@@ -61,12 +61,9 @@ class Tiled(eqx.Module):
         """As the effect."""
 
         # Out here: the program does not know which lights these are.
-        def chosen(members):
-            shadows = [
-                jnp.asarray(visibilities[n]) if n in self.shadowed else None for n in members
-            ]
-            return list(zip((lights[n] for n in members), shadows, strict=True))
-
+        name = "relight(visibilities)"
+        seen = {n: as_array(name, visibilities[n]) for n in self.shadowed}
+        chosen = lambda members: [(lights[n], seen.get(n)) for n in members]
         parts = [(chosen(part.members), part.item, part.pixels) for part in self.parts]
         return _tiled(gbuffer, camera, chosen(self.everywhere), parts)
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfx._checks import whole_number
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.scene import _embree, _opengl
@@ -158,10 +159,8 @@ def _visible(
         raise ValueError(
             f"`scene.{caller}(scene)` must be a Scene, got {type(scene).__name__}."
         )
-    if isinstance(layer, bool) or not hasattr(layer, "__index__") or layer < 0:
-        raise ValueError(
-            f"`scene.{caller}(layer=...)` must be an integer from 0, got {layer!r}."
-        )
+    name, expected = f"scene.{caller}(layer=...)", "an integer from 0"
+    layer = whole_number(name, layer, lambda n: n >= 0, expected)
     _warn_of_rounding(scene, camera, caller)
     first_faces = _backend(caller, backend)
     hits = intersect(scene, view, first_faces(scene, view, np.zeros((height, width))))
