@@ -25,7 +25,6 @@ from jaxfx import (
     scene,
     shadow,
 )
-from jaxfx._sampling import pixel_centers
 
 
 STILL, FENCE, SPIKES, HILLS, POSTS = "still life", "fence", "spikes", "hills", "posts"
@@ -307,7 +306,7 @@ def shadowed(at: Point) -> Case:
     known = jnp.isfinite(gbuffer.depth)
     depth = jnp.where(known, gbuffer.depth, 1)
     receivers = shadow.receivers(depth, camera, eye, normal=gbuffer.normal)
-    points = np.asarray(camera.unproject(pixel_centers(at.side, at.side, jnp.float32), depth))
+    points = np.asarray(camera.points(depth))
     points = points + 2e-3 * np.asarray(gbuffer.normal)
     right, down = lamp * np.asarray(eye.world_from_camera)[:3, :2].T
     steps = (np.arange(6) + 0.5) / 6 - 0.5

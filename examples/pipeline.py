@@ -29,8 +29,6 @@ from jaxtyping import Array, Float
 
 from jaxfx import dof, fit, relight, reproject, scene, shadow
 from jaxfx._files import write_whole
-from jaxfx._numerics import normalize
-from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.lens import ThinLens
@@ -128,7 +126,7 @@ def new_view(stage: Stage, camera: PinholeCamera) -> GBuffer:
     shader = jnp.where(jnp.sum(kinds, axis=-1) > 0.5, jnp.argmax(kinds, axis=-1), -1)
     # A hole lies beyond everything, until it is filled: then it is where its neighbor is.
     depth = jnp.where(alpha > 0, here.project(points)[1], FAR * stage.distance)
-    surface = ambient, diffuse, specular, normalize(normal)
+    surface = ambient, diffuse, specular, normal  # Shading makes them unit vectors.
     made = GBuffer(points, shader, *surface, depth=depth, roughness=image[..., 18])
     made, _ = relight.fill_holes(made, (alpha > 0).astype(int))
     return moving(made, camera)
@@ -137,7 +135,7 @@ def new_view(stage: Stage, camera: PinholeCamera) -> GBuffer:
 def channels(cache: GBuffer, camera: PinholeCamera) -> Float[Array, "height width 19"]:
     """The world's points and all that shading reads, the shaders' numbers one by one."""
     depth = jnp.where(jnp.isfinite(cache.depth), cache.depth, 1)
-    points = camera.unproject(pixel_centers(depth.shape[0], depth.shape[1], depth.dtype), depth)
+    points = camera.points(depth)
     kinds = jax.nn.one_hot(cache.shader, 3, dtype=depth.dtype)
     surface = cache.ambient, cache.diffuse, cache.specular, cache.normal
     return jnp.dstack([points, *surface, kinds, cache.roughness])
@@ -248,8 +246,7 @@ def set_stage(path: Path | None, height: int, map_size: int) -> tuple[Mesh, Stag
         fail(error)
     seen = np.isfinite(middle.depth)
     distance = float(np.median(middle.depth[seen]))
-    points = base.unproject(pixel_centers(*shape), jnp.where(seen, middle.depth, 1))
-    points = np.asarray(points)[seen]
+    points = np.asarray(base.points(jnp.where(seen, middle.depth, 1)))[seen]
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=-1).max())
     mesh = Mesh(loaded, centre, radius, map_size)

@@ -124,12 +124,10 @@ def warped_depth(gbuffers, cameras, target):
     A cache's points in the world are warped as if they were its colours.
     """
     height, width = gbuffers[0].depth.shape
-    columns, rows = (jnp.arange(side, dtype=jnp.float32) + 0.5 for side in (width, height))
-    pixels = jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
     nearest = jnp.full((height, width), jnp.inf, jnp.float32)
     for gbuffer, camera in zip(gbuffers, cameras, strict=True):
         known = jnp.isfinite(gbuffer.depth)
-        points = camera.unproject(pixels, jnp.where(known, gbuffer.depth, 1))
+        points = camera.points(jnp.where(known, gbuffer.depth, 1))
         image = jnp.concatenate([points, known[..., None].astype(points.dtype)], axis=-1)
         moved, alpha = reproject.warp(image, gbuffer.depth, camera, target)
         depth = target.project(moved[..., :3])[1]

@@ -26,7 +26,6 @@ from tqdm.auto import tqdm
 
 from jaxfx import AmbientLight, DirectionalLight, io, relight, scene, shadow
 from jaxfx._files import write_whole
-from jaxfx._sampling import pixel_centers
 
 
 matplotlib.use("Agg")
@@ -95,7 +94,7 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
     # The map takes in what is seen, and what lies as far again towards the light.
     seen = np.isfinite(gbuffer.depth)
     depth = jnp.where(seen, gbuffer.depth, 1)
-    points = np.asarray(camera.unproject(pixel_centers(size, size, depth.dtype), depth))[seen]
+    points = np.asarray(camera.points(depth))[seen]
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=-1).max())
     (light_camera,) = shadow.light_cameras(key, map_size=map_size, centre=centre, radius=radius)
@@ -166,7 +165,7 @@ def draw_steps(stage: Stage, size: int, visible, where, path: Path) -> None:
     bias = {"bias": stage.bias, "slope_bias": size / 2}
     data = stage.shadow_map, stage.receivers
     hard = stage.picture(shadow.hard(*data, **bias))
-    edges = shadow.candidates(*data, size=size, dilation=1, **bias).where
+    edges = shadow.candidates(*data, size=size, mask="screen", dilation=1, **bias).where
     steps = {
         "hard shadow": hard,
         "its edges": marked(hard, np.asarray(edges)),

@@ -3,9 +3,10 @@
 An image and its depth, or a deep frame buffer, go in; images come out, with true gradients.
 
 The types live here. The effects are the modules `blur`, `dof`, `reproject`, `shadow` and
-`relight`; `fit`, `budget`, `metrics` and `tradeoff` work on top of them; `scene`, `exr` and
-`io` read and write files on the host. A module is loaded when it is first used, so
-`import jaxfx; jaxfx.dof.scatter` works and nothing is loaded in vain.
+`relight`; `fit`, `budget`, `metrics` and `tradeoff` work on top of them; `depth` reads depth as
+cameras, networks and files give it; `scene`, `exr` and `io` read and write files on the host.
+A module is loaded when it is first used, so `import jaxfx; jaxfx.dof.scatter` works and nothing
+is loaded in vain.
 """
 
 import importlib
@@ -39,7 +40,7 @@ _MODULES = frozenset(
     {
         *("blur", "dof", "reproject", "shadow", "relight"),
         *("fit", "budget", "metrics", "tradeoff"),
-        *("scene", "exr", "io"),
+        *("depth", "scene", "exr", "io"),
     }
 )
 

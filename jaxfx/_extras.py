@@ -8,8 +8,8 @@ from typing import final
 class needs:
     """A context for imports of libraries that the plain installation lacks.
 
-    `with needs("io"): import PIL` raises an `ImportError` that names the extra where the import
-    fails.
+    `with needs("io"): import PIL` raises an `ImportError` that names the extra where the
+    library is not installed. One that is installed and fails to load keeps its own error.
     """
 
     def __init__(self, extra: str):
@@ -24,7 +24,7 @@ class needs:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if isinstance(error, ImportError):
+        if isinstance(error, ModuleNotFoundError):
             raise ImportError(
                 f"{error}. It comes with an extra: pip install 'jaxfx[{self.extra}]'",
                 name=error.name,

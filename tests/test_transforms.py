@@ -39,6 +39,9 @@ HANDED_ON = {
     ("reproject.choose", "target"),
 }
 
+# Options that a traced argument needs: the default serves concrete ones alone.
+NEEDED = {("blur.gaussian", "taps"): 9}
+
 # Searches that end off the surface whose derivative they take: it is not that of their error.
 ROUGH = {"descent", "linear", "relief"}
 
@@ -149,7 +152,7 @@ EXAMPLES = {
     "bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "slope_bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "size": [lambda rng, size: 3],
-    "dilation": [lambda rng, size: 2],
+    "dilation": [lambda rng, size: None, lambda rng, size: 2],
     "light_size": [lambda rng, size: np.array(rng.uniform(0.2, 0.3))],
     "min_variance": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "camera": [pinhole, orthographic],
@@ -172,6 +175,13 @@ EXAMPLES = {
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "behind": [lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size))],
+    "disparity": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "distance": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "scale": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "shift": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "focal_pixels": [lambda rng, size: np.array(rng.uniform(20, 30))],
+    "baseline": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "softness": [lambda rng, size: np.array(rng.uniform(1, 2))],
 }
 
@@ -276,6 +286,7 @@ def _cases(name, function):
     parameters = inspect.signature(function).parameters.values()
     choices = {p.name: _choices(p) for p in parameters}
     choices = {p: v[:1] if (name, p) in HANDED_ON else v for p, v in choices.items()}
+    choices |= {p: [NEEDED[name, p]] for p in choices if (name, p) in NEEDED}
     if missing := [f"an example for `{name}`" for name in choices if not choices[name]]:
         return {}, missing
     cases, missing = {}, {(p, i) for p, values in choices.items() for i in range(len(values))}

@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfx._arguments import check_camera, check_lens
 from jaxfx._checks import Number
 from jaxfx.budget._plan import Plan, check_call, plan
 from jaxfx.camera import PinholeCamera
@@ -61,6 +62,10 @@ def accumulate(
 
     Source: the variance of a mean; Cook, Porter & Carpenter 1984 sample the lens so.
     """
+    check_camera("accumulate(camera)", camera, PinholeCamera)
+    if not isinstance(lens, ThinLens):
+        raise ValueError(f"`accumulate(lens)` must be a ThinLens, got {type(lens).__name__}.")
+    check_lens("accumulate(lens)", lens)
     max_error = check_call("accumulate", max_error, (camera, lens))
     if max_error == 0:
         raise ValueError("`accumulate(max_error=...)` must be positive, got 0.")

@@ -4,7 +4,6 @@ import math
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Num
@@ -13,7 +12,7 @@ from jaxfx._arguments import check_lens
 from jaxfx._checks import Number, check_depth, check_image, option
 from jaxfx.budget._octaves import octaves
 from jaxfx.budget._plan import Part, Plan, Search, Trial, check_call, plan
-from jaxfx.dof._inputs import compiled, largest_coc, largest_of
+from jaxfx.dof._inputs import check_arguments, compiled, largest_coc, largest_of
 from jaxfx.dof.blend import blend
 from jaxfx.dof.diffusion import implicit_diffusion
 from jaxfx.dof.gather import gather
@@ -33,12 +32,12 @@ _PARTS, _SIDE, _SHARE = 6, 64, 1 / 4
 
 
 def _nothing(image: Any, depth: Any, lens: Any) -> Any:
-    return jnp.asarray(image)
+    return check_image("dof(image)", image)
 
 
 def _in_octaves(image: Any, depth: Any, lens: Any, **options: Any) -> Any:
-    image, depth = jnp.asarray(image), jnp.asarray(depth)
-    return octaves(image, depth, compiled("dof", lens, depth), **options)
+    image, depth, lens, _ = check_arguments("dof", image, depth, lens, options["max_coc"])
+    return octaves(image, depth, lens, **options)
 
 
 _METHODS = {

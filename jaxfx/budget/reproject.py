@@ -10,13 +10,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxfx._checks import Number
+from jaxfx._checks import Number, check_image, parameter
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
 from jaxfx.budget._tiles import Blocks, allowed, blocks, spend, sums, tile_of
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.reproject.blend import Sight, blend
+from jaxfx.reproject.blend import Sight, blend, check_sources
 
 
 _OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
@@ -103,7 +103,8 @@ def reproject(
 
     **Gradient:** none through the choice; the plan's picture has that of what it draws.
     """
-    data = (images, depths, sources, target)
+    data = check_sources("reproject", images, depths, sources, target)
+    images, depths, sources, _ = data
     max_error = check_call("reproject", max_error, data)
     search = Search(Everything(shape), data, max_error)
     height, width = search.whole[1].shape[:2]
@@ -127,9 +128,9 @@ def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> 
     """The sources of all parts, with their blocks. A program does not know which they are."""
 
     def source(index: int) -> tuple[Array, Array, PinholeCamera]:
-        depth = jnp.asarray(depths[index])
+        depth = parameter("reproject(depths)", depths[index], None)
         return (
-            jnp.asarray(images[index]),
+            check_image("reproject(images)", images[index]),
             depth.astype(working_dtype(depth.dtype)),
             sources[index],
         )

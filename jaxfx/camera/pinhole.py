@@ -133,6 +133,7 @@ class PinholeCamera(eqx.Module):
         **Gradient:** exact; zero where the pose is degenerate.
         """
         pose = look_at_pose(eye, target, up)
+        height, width = _size("look_at", height, width)
         return cls.from_fov(fov_y, height=height, width=width, world_from_camera=pose)
 
     @classmethod

@@ -8,6 +8,7 @@ flows into or out of what is in focus. The conductance is symmetric, so that ene
 
 import functools as ft
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -119,7 +120,7 @@ def implicit_diffusion(
     return _implicit(image, depth, lens, edge, max_coc)
 
 
-def _check_edge(function: str, edge: Float[ArrayLike, ""] | float) -> Float[Array, ""]:
+def _check_edge(function: str, edge: Any) -> Float[Array, ""]:
     name = f"{function}(edge=...)"
     edge = parameter(name, edge)
     check(name, edge, lambda v: v > 0, "positive")

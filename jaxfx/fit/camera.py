@@ -12,11 +12,11 @@ import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
-from tqdm.auto import tqdm
 
 from jaxfx._arguments import check_camera
 from jaxfx._checks import Number, WholeNumber, check, check_image, whole_number
 from jaxfx._numerics import safe_divide
+from jaxfx._progress import Bar
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
@@ -66,7 +66,7 @@ def camera(
     solver: Solver | None = None,
     max_steps: WholeNumber = 32,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> CameraFit:
     """The pose from which a photograph was taken, given another one with its depth.
 
@@ -104,7 +104,7 @@ def camera(
       Levenberg-Marquardt.
     - `max_steps`: of the solver, for each blur.
     - `throw`: raise where the solver fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `CameraFit`.
 
@@ -120,7 +120,7 @@ def camera(
     reference, image, depth = _pictures(reference, image, depth)
     max_steps = _check(source, start, max_steps)
     check_options("camera", reference.shape[:2], "pyramid", hole_threshold)
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         model, end = _search(
             reference, image, depth, source, start, float(hole_threshold), descend_on

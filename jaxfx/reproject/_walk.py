@@ -123,7 +123,8 @@ def walk(
     thickness = jnp.max(jnp.where(finite, depth, -jnp.inf)) - nearest
 
     def together(rays):
-        r = _grid.rays(*rays, from_end)
+        begin, along = rays
+        r = _grid.rays(begin, along, from_end)
         state, steps = _begin(pyramid, thickness, r)
         return _end(pyramid, r, *_walk(pyramid, r, state, steps, limit))
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._checks import Number, WholeNumber, check_image, items, whole_number
+from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
@@ -70,13 +70,12 @@ def blend(
     Source: the several references that Kim, Ki, Lee & Oh name as future work; the weights are
     our own.
     """
-    _check_lists("blend", images=images, depths=depths, sources=sources)
-    images = [check_image("blend(images)", image) for image in images]
+    given = check_sources("blend", images, depths, sources, target)
+    images, depths, sources, target = given
     size = check_options("blend", shape or images[0].shape[:2], method, hole_threshold)
-    depths = _checked("blend", depths, [image.shape[:2] for image in images], sources, target)
     options = {"method": method, "hole_threshold": float(hole_threshold)}
     seen = Sight(target, pixel_centers(*size).reshape(-1, 2), options)
-    return _blended(seen, images, depths, list(sources), size)
+    return _blended(seen, images, depths, sources, size)
 
 
 @eqx.filter_jit
@@ -138,11 +137,12 @@ def choose(
     most = len(sources)
     is_valid = lambda n: 1 <= n <= most
     count = whole_number("choose(count=...)", count, is_valid, f"an integer from 1 to {most}")
-    size = shape or jnp.shape(depths[0])[:2]
+    depths = [check_map("choose(depths)", depth) for depth in depths]
+    size = shape or depths[0].shape
     height, width = check_options("choose", size, "pyramid", hole_threshold)
     rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in (height, width))
     pixels = pixel_centers(height, width)[rows, columns].reshape(-1, 2)
-    depths = _checked("choose", depths, list(map(jnp.shape, depths)), sources, target)
+    depths = _checked("choose", depths, [depth.shape for depth in depths], sources, target)
     options = {"method": "pyramid", "hole_threshold": float(hole_threshold)}
     return _chosen(Sight(target, pixels, options), depths, list(sources), count)
 
@@ -163,6 +163,16 @@ def _chosen(seen: "Sight", depths: list, sources: list, count: int) -> Choice:
         chosen.append(index.astype(jnp.int32))
         reached.append(jnp.mean(best))
     return Choice(jnp.stack(chosen), jnp.stack(reached))
+
+
+def check_sources(
+    caller: str, images: Any, depths: Any, sources: Any, target: Any
+) -> tuple[list[Array], list[Array], list[PinholeCamera], Camera]:
+    """Pictures, depths and cameras, as lists; `ValueError` names a fault."""
+    _check_lists(caller, images=images, depths=depths, sources=sources)
+    images = [check_image(f"{caller}(images)", image) for image in images]
+    depths = _checked(caller, depths, [image.shape[:2] for image in images], sources, target)
+    return images, depths, list(sources), target
 
 
 def _check_lists(caller: str, **lists: Any) -> None:

@@ -92,7 +92,7 @@ def _drawn(
     return drawn.reshape(*shape, -1), view.mask.astype(image.dtype).reshape(shape)
 
 
-def check_source(caller: str, depth: ArrayLike, shape: tuple[int, ...]) -> Array:
+def check_source(caller: str, depth: Any, shape: tuple[int, ...]) -> Array:
     """`depth` as a float array of `shape`, whatever it holds; `ValueError` otherwise."""
     array = parameter(f"{caller}(depth)", depth, None)
     if array.shape != shape or max(shape) > LARGEST:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfx._checks import whole_number
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.scene import _embree, _opengl
@@ -21,6 +22,7 @@ _logger = logging.getLogger("jaxfx.scene")
 _Camera = PinholeCamera | OrthographicCamera
 _FirstFaces = Callable[[Scene, View, np.ndarray], np.ndarray]
 _BACKENDS = {"opengl": _opengl, "embree": _embree}
+_COARSE = 1e-3  # of the scene's scale: a rounding of the camera's place to speak of
 _GAP = 1e-5  # between layers, of their depth and of the scene's scale
 
 
@@ -157,16 +159,30 @@ def _visible(
         raise ValueError(
             f"`scene.{caller}(scene)` must be a Scene, got {type(scene).__name__}."
         )
-    if isinstance(layer, bool) or not hasattr(layer, "__index__") or layer < 0:
-        raise ValueError(
-            f"`scene.{caller}(layer=...)` must be an integer from 0, got {layer!r}."
-        )
+    name, expected = f"scene.{caller}(layer=...)", "an integer from 0"
+    layer = whole_number(name, layer, lambda n: n >= 0, expected)
+    _warn_of_rounding(scene, camera, caller)
     first_faces = _backend(caller, backend)
     hits = intersect(scene, view, first_faces(scene, view, np.zeros((height, width))))
     for _ in range(layer):
         faces = _next_faces(first_faces, scene, view, hits, (height, width))
         hits = intersect(scene, view, faces)
     return view, hits, (height, width)
+
+
+def _warn_of_rounding(scene: Scene, camera: _Camera, caller: str) -> None:
+    """Say where a camera's numbers have not kept its place to a thousandth of the scene."""
+    pose = np.asarray(camera.world_from_camera)
+    rounding = float(np.spacing(np.abs(pose[:3, 3]).max())) / 2
+    if rounding > _COARSE * scene.scale:
+        _logger.warning(
+            "scene.%s(camera): the camera's place is rounded to %.2g in %s, where the scene is "
+            "%.2g in size: move both to the origin, or set jax_enable_x64",
+            caller,
+            rounding,
+            pose.dtype,
+            2 * scene.scale,
+        )
 
 
 def _next_faces(

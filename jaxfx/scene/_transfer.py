@@ -6,7 +6,6 @@ surface. The matrix from points to pixels is smooth, and a few of its singular v
 nearly all of it. They are found on some of its rows, so that the whole is never in memory.
 """
 
-import operator
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -15,6 +14,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfx._arguments import check_camera, check_gbuffer
+from jaxfx._checks import as_numpy, whole_number
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer, Transfer
@@ -58,11 +59,12 @@ def visible(
     _require_embree("visible")
     ends = []
     for name, value in (("start", start), ("end", end)):
-        if np.shape(value)[-1:] != (3,):
+        points = as_numpy(f"scene.visible({name})", value)
+        if points.shape[-1:] != (3,):
             raise ValueError(
-                f"`scene.visible({name})` must have shape (..., 3), got {np.shape(value)}."
+                f"`scene.visible({name})` must have shape (..., 3), got {points.shape}."
             )
-        ends.append(np.asarray(value, np.float64))
+        ends.append(points.astype(np.float64))
     one, other = np.broadcast_arrays(*ends)
     seen = _embree.unobstructed(scene, one.reshape(-1, 3), other.reshape(-1, 3))
     return jnp.asarray(seen.reshape(one.shape[:-1]))
@@ -104,9 +106,12 @@ def transfer(
     Wallace, Elmquist & Haines 1989's.
     """
     _require_embree("transfer")
+    check_camera("scene.transfer(camera)", camera)
+    gbuffer = check_gbuffer("scene.transfer(gbuffer)", gbuffer)
     points = _count("points", points, None)
     rank = _count("rank", rank, points)
-    shown = np.isfinite(gbuffer.depth) & (np.asarray(gbuffer.shader) >= 0)
+    shown = np.isfinite(gbuffer.depth) & (gbuffer.depth > 0) & (gbuffer.shader >= 0)
+    shown = np.asarray(shown)
     if not shown.any():
         raise ValueError("`scene.transfer(gbuffer)` must show something, got nothing.")
     height, width = gbuffer.depth.shape
@@ -195,12 +200,11 @@ def _blocks(
 
 
 def _count(name: str, value: Any, most: int | None) -> int:
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise ValueError(f"`scene.transfer({name}=...)` must be an integer, got {value!r}.")
-    if not 1 <= value <= (value if most is None else most):
-        limit = "at least 1" if most is None else f"in [1, {most}]"
-        raise ValueError(f"`scene.transfer({name}=...)` must be {limit}, got {value}.")
-    return operator.index(value)
+    limit = "at least 1" if most is None else f"in [1, {most}]"
+    is_valid = lambda n: 1 <= n <= (n if most is None else most)
+    name = f"scene.transfer({name}=...)"
+    count = whole_number(name, value, lambda n: True, "an integer")
+    return whole_number(name, count, is_valid, limit)
 
 
 def _require_embree(caller: str) -> None:

@@ -1,14 +1,14 @@
 """Cameras on the host: in float64 NumPy, and the ones a scene is seen with by default."""
 
 import functools
-import operator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxfx._checks import is_concrete
+from jaxfx._arguments import check_camera
+from jaxfx._checks import is_concrete, whole_number
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.light import AmbientLight, DirectionalLight
@@ -17,12 +17,10 @@ from jaxfx.scene._scene import Scene
 
 def check_size(caller: str, *sides: Any) -> list[int]:
     """Height and width as integers; `ValueError` names `caller` for any other."""
-    for name, side in zip(("height", "width"), sides, strict=True):
-        if isinstance(side, bool) or not hasattr(side, "__index__") or side < 1:
-            raise ValueError(
-                f"`scene.{caller}({name}=...)` must be a positive integer, got {side!r}."
-            )
-    return [operator.index(side) for side in sides]
+    return [
+        whole_number(f"scene.{caller}({name}=...)", side)
+        for name, side in zip(("height", "width"), sides, strict=True)
+    ]
 
 
 class View(NamedTuple):
@@ -40,11 +38,7 @@ class View(NamedTuple):
     def of(cls, camera: PinholeCamera | OrthographicCamera, caller: str) -> "View":
         """The camera's numbers; `ValueError` names `caller` where they can't be used."""
         name = f"{caller}(camera)"
-        if not isinstance(camera, PinholeCamera | OrthographicCamera):
-            raise ValueError(
-                f"`{name}` must be a PinholeCamera or an OrthographicCamera, "
-                f"got {type(camera).__name__}."
-            )
+        check_camera(name, camera)
         if not is_concrete(camera):
             raise ValueError(
                 f"`{name}` must be concrete, got a traced camera: scenes are rendered on the "

@@ -24,8 +24,8 @@ def pcss(
     *,
     size: WholeNumber,
     light_size: Float[ArrayLike, ""] | float,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
     """Soft shadows of a light with an extent: narrow where a thing stands, wide far from it.
@@ -43,7 +43,7 @@ def pcss(
     - `size`: static; odd, in texels.
     - `light_size`: the light's diameter, in scene units before a pinhole camera, in radians,
       as seen from the scene, before an orthographic one.
-    - `bias`, `slope_bias`, `softness`: scene units and pixels, as in `pcf`.
+    - `bias`, `slope_bias`, `softness`: scene units and texels, as in `pcf`.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
 

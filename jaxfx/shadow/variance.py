@@ -20,8 +20,8 @@ def variance(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     min_variance: Float[ArrayLike, ""] | float = 0.0,
 ) -> Float[Array, "height width"]:
     """Visibility by an upper bound from the mean and the variance of the filtered depths.
@@ -37,7 +37,8 @@ def variance(
     - `shadow_map`, `receivers`: height width, as in `hard`. An inf, or what is missing, counts
       as the farthest depth of map and receivers.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and pixels, as in `hard`.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, what
+      rounding takes: a plane's mean depth, read between texels, is the plane's.
     - `min_variance`: scene units squared; the variance is at least this.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
@@ -49,7 +50,8 @@ def variance(
 
     Source: Donnelly & Lauritzen 2006, variance shadow maps, equations 4 and 5.
     """
-    data = _taps.checked("variance", shadow_map, receivers, bias, slope_bias, size=size)
+    data = (shadow_map, receivers, bias, slope_bias)
+    data = _taps.checked("variance", *data, size=size, middle=0.0)
     least = parameter("variance(min_variance=...)", min_variance)
     check(
         "variance(min_variance=...)", least, lambda v: (v >= 0) & (v < np.inf), "0 or positive"

@@ -151,6 +151,7 @@ def test_failure_is_said():
     fitted = quietly(picture(), cache(), WRONG[0], max_steps=2, throw=False)
     assert not fitted.success
     assert fitted.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert "maximum number of steps" in str(fitted.result)
     assert len(fitted.losses) == 3 and np.isfinite(fitted.losses).all()
 
 
@@ -261,6 +262,28 @@ def test_a_pixel_whose_depth_is_missing_has_no_say(missing):
     found = quietly(wrong, holed, start)
     assert found.success
     assert_close(found.lights, lights, 1e-3)
+
+
+# Behind the surface, and turned away from it: neither lights anything.
+AWAY = (PointLight([0.0, 0.0, 50.0], WHITE), SpotLight([0, 0, -1], [0, 0, -1], WHITE, 0.2, 0.3))
+
+
+@pytest.mark.parametrize("light", AWAY, ids=lambda light: type(light).__name__)
+def test_a_start_that_nothing_moves_is_said(light, caplog):
+    """The log names it beside others; alone it is an error."""
+    fitted = quietly(picture(), cache(), (*SUNS, light), throw=False)
+    (message,) = {record.getMessage() for record in caplog.records if record.name == "jaxfx"}
+    assert "can't move" in message and f"position of light {len(SUNS)}" in message
+    np.testing.assert_array_equal(fitted.lights[-1].position, light.position)
+    assert np.isinf(fitted.uncertainty[-1]["position"]).all()
+    with pytest.raises(ValueError, match=r"`lights\(lights\)` must start where.* position of"):
+        quietly(picture(), cache(), (light,), parameters=("position",))
+
+
+def test_a_start_that_moves_says_nothing(caplog):
+    fitted = quietly(picture(), cache(), SUNS, parameters=("color",))
+    assert not caplog.records
+    assert str(fitted.result) == repr(fitted.result) == "The search converged."
 
 
 FAULTS = {

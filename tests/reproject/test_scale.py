@@ -41,7 +41,7 @@ def orthographic(matrix, distance, dtype):
 
 
 def on_plane(matrix, distance, is_orthographic):
-    """Where the source sees what a target sees of a plane across its axis, if it is ahead."""
+    """The source's pixels of what a target sees of a plane, and whether it sees them."""
     across = np.stack([(X - WIDTH / 2) / FOCAL, (Y - HEIGHT / 2) / FOCAL], axis=-1)
     if is_orthographic:
         begin = distance * np.concatenate([across, np.zeros_like(across[..., :1])], axis=-1)
