@@ -72,8 +72,7 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     x, y = pixels[..., 0], pixels[..., 1]
     inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     flat = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
-    # Asked for once, not anew by each image that is read.
-    index = jax.lax.optimization_barrier(nearest(flat, jax.lax.stop_gradient(pixels)))
+    index = nearest(flat, jax.lax.stop_gradient(pixels))
     take = lambda field: read(field, index)
     shader, cached = take(gbuffer.shader), take(gbuffer.depth).astype(dtype)
     normal = take(gbuffer.normal).astype(dtype)

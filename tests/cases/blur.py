@@ -20,7 +20,7 @@ SIDE = 48
 @ft.cache
 def _program(sampling: Any, passes: int = 1, is_wide: bool = False) -> Any:
     """Of an image; and of sigma, if that is asked for."""
-    call = ft.partial(blur.gaussian, sampling=sampling, passes=passes)
+    call = ft.partial(blur.gaussian, taps=9, sampling=sampling, passes=passes)
     return jax.jit((lambda image, sigma: call(image, sigma=sigma)) if is_wide else call)
 
 
