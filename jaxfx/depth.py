@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._checks import check, check_image, is_concrete, parameter
+from jaxfx._checks import as_array, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
@@ -261,7 +261,8 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
 
     What a NumPy mask hides is NaN.
     """
-    array = values if isinstance(values, jax.Array) else np.asanyarray(values)
+    is_masked = isinstance(values, np.ma.MaskedArray)
+    array = as_array(name, values.data if is_masked else values)
     is_integer = array.dtype.kind in "iu"
     if not is_integer and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"`{name}` must hold real numbers, got {array.dtype}.")
@@ -270,13 +271,11 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
             f"`{name}` must be of shape (height, width), none of them 0, got {array.shape}. "
             "Batches are made with `jax.vmap`."
         )
-    # JAX takes no bytes in another order than the machine's.
-    native = array.dtype.newbyteorder("=")
-    dtype = jnp.result_type(float) if is_integer else working_dtype(native)
+    dtype = jnp.result_type(float) if is_integer else working_dtype(array.dtype)
     array = array.astype(dtype)
-    if isinstance(array, np.ma.MaskedArray):
-        array = array.filled(np.nan)
-    return jnp.asarray(array), is_integer
+    if is_masked:
+        array = jnp.where(np.ma.getmaskarray(values), jnp.nan, array)
+    return array, is_integer
 
 
 def _numbers_and_sky(

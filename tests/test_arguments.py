@@ -30,6 +30,7 @@ from jaxfx import (
     _arguments,
     blur,
     budget,
+    depth as depth_of,
     dof,
     fit,
     metrics,
@@ -46,6 +47,7 @@ DEPTH = RNG.uniform(2.0, 2.2, SIZE)
 CAMERA = PinholeCamera.from_fov(0.9, height=SIZE[0], width=SIZE[1])
 FLAT = OrthographicCamera(6.0, [8.0, 6.0], np.eye(4))
 LENS = ThinLens(0.1, 2.1, 30.0)
+WIDE = ThinLens(5.0, 2.6, 30.0)
 LIGHT = PointLight([0.0, -1.0, 0.0], [1.0, 1.0, 1.0])
 NORMAL = np.broadcast_to([0.0, 0, -1], (*SIZE, 3))
 ROUGH = np.full(SIZE, 0.5)
@@ -131,10 +133,13 @@ CALLS = {
     "shadow.prefiltered": (shadow.prefiltered, SHADOWED | {"size": 3}),
     "shadow.pcf": (shadow.pcf, SHADOWED | {"size": 3, "softness": 0.1}),
     "shadow.edge_pcf": (
-        shadow.edge_pcf,
+        ft.partial(shadow.edge_pcf, mask="screen"),
         SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2},
     ),
-    "shadow.candidates": (shadow.candidates, SHADOWED | {"size": 3, "dilation": 2}),
+    "shadow.candidates": (
+        ft.partial(shadow.candidates, mask="screen"),
+        SHADOWED | {"size": 3, "dilation": 2},
+    ),
     "shadow.pcss": (
         shadow.pcss,
         SHADOWED | {"light_camera": FLAT, "size": 3, "light_size": 0.1},
@@ -189,10 +194,24 @@ CALLS = {
         lambda render: inspect.unwrap(relight.capture_normals)(lambda lights: render),
         {"render": IMAGE},
     ),
+    "depth.clean": (depth_of.clean, {"depth": DEPTH, "scale": 2.0}),
+    "depth.fill": (depth_of.fill, {"depth": DEPTH, "image": IMAGE}),
+    "depth.from_disparity": (
+        depth_of.from_disparity,
+        {"disparity": DEPTH, "scale": 2.0, "shift": 0.1},
+    ),
+    "depth.from_stereo": (
+        depth_of.from_stereo,
+        {"disparity": DEPTH, "focal_pixels": 9.0, "baseline": 0.1, "offset": 0.1},
+    ),
+    "depth.from_ray_distance": (
+        depth_of.from_ray_distance,
+        {"distance": DEPTH, "camera": CAMERA},
+    ),
     "fit.dof": (
         ft.partial(fit.dof, **QUIET),
         {
-            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "lens": LENS, "gamma": 1.0},
+            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "lens": WIDE, "gamma": 1.0},
             **{"epsilon": 1.0, "threshold": 1.0, "max_coc": 4.0},
         },
     ),
@@ -333,6 +352,7 @@ WRONG = {
 # Left out, these are something else.
 MAY_BE_NONE = {
     *("visibility", "sigma", "softness", "normal", "color", "diffuse", "specular", "roughness"),
+    *("bias", "slope_bias"),
 }
 
 ARRAYS = [
@@ -349,6 +369,8 @@ def test_what_is_no_array_is_named(name, argument):
     for kind, make in WRONG.items():
         if kind == "None" and argument in MAY_BE_NONE:
             continue
+        if kind == "masked" and name.startswith("depth."):
+            continue  # A mask says there that a depth is missing.
         wrong = make(arguments[argument])
         with pytest.raises((ValueError, TypeError), match=r"^`") as caught:
             _bare(function)(**arguments | {argument: wrong})
