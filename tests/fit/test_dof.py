@@ -180,7 +180,8 @@ def test_any_solver_or_minimiser(solver):
 
 def test_failure_is_said():
     start = wrong((0, 1, 0, 1))
-    with pytest.raises(RuntimeError, match=r"no fit in \d+ steps.*from [\de.-]+ to [\de.-]+"):
+    said = r"found no l\w+ in \d+ steps.*from [\de.-]+ to [\de.-]+"
+    with pytest.raises(RuntimeError, match=said):
         quietly(*picture(), start, max_steps=3)
     fitted = quietly(*picture(), start, max_steps=3, throw=False)
     assert not fitted.success
@@ -240,7 +241,7 @@ FAULTS = {
     "dof(reference)": {"reference": np.zeros((SIZE, SIZE - 1, 3))},
     "dof(reference) must be finite": {"reference": np.full((SIZE, SIZE, 3), np.nan)},
     "dof(depth)": {"depth": np.ones((SIZE, SIZE + 1))},
-    "dof(depth) must be positive": {"depth": np.zeros((SIZE, SIZE))},
+    "dof(depth) must be known somewhere": {"depth": np.zeros((SIZE, SIZE))},
     "dof(lens)": {"lens": FocusPlanes(1.0, 2.0, 3.0, 4.0)},
     "dof(lens.aperture)": {"lens": ThinLens(0.0, 3.0, 120.0)},
     "dof(lens) must start with a circle": {"lens": ThinLens(1e-3, 3.0, 120.0)},
@@ -256,7 +257,7 @@ FAULTS = {
     "dof(method=...)": {"method": "gather"},
     "dof(threshold=...)": {"threshold": -1.0},
     "dof(max_steps=...)": {"max_steps": 0},
-    "scatter(max_coc=...)": {"max_coc": -1},
+    "dof(max_coc=...) must be positive": {"max_coc": -1},
 }
 
 

@@ -146,7 +146,8 @@ def test_what_is_frozen_stays():
 
 
 def test_failure_is_said():
-    with pytest.raises(RuntimeError, match=r"no fit in \d+ steps.*from [\de.-]+ to [\de.-]+"):
+    said = r"found no l\w+ in \d+ steps.*from [\de.-]+ to [\de.-]+"
+    with pytest.raises(RuntimeError, match=said):
         quietly(picture(), cache(), WRONG[0], max_steps=2)
     fitted = quietly(picture(), cache(), WRONG[0], max_steps=2, throw=False)
     assert not fitted.success
