@@ -21,6 +21,7 @@ import pytest
 
 import jaxfx
 import jaxfx.shadow
+from jaxfx._checks import WholeNumber
 from tests.helpers.quick import quick_jit, quickly
 
 
@@ -249,7 +250,8 @@ def _functions():
             if f"{module.name}.{name}" in NO_PICTURES:
                 continue
             first = next(iter(inspect.signature(function).parameters.values())).annotation
-            if first not in (int, float, str) and get_origin(first) is not Callable:
+            is_array = first not in (int, float, str, WholeNumber)
+            if is_array and get_origin(first) is not Callable:
                 found[f"{module.name}.{name}"] = function
     return found
 
