@@ -206,7 +206,7 @@ def test_faults_name_the_argument():
 def test_pictures_of_other_types_are_summed_as_floats(kind, value, result):
     """256 of them: their sum is beyond what bytes and halves hold."""
     picture = np.full((2, 2, 3), value, kind)
-    rounding = 256 * np.finfo(np.float32).eps  # of a sum of so many
+    rounding = float(256 * np.finfo(np.float32).eps)  # of a sum of so many
     found = accumulate(lambda _: picture, samples=256)
     assert found.image.dtype == result
     np.testing.assert_allclose(found.image.astype(float), picture.astype(float), rtol=rounding)
