@@ -217,7 +217,7 @@ def main() -> None:
 
     filled = without_holes(depth)
     start = wrong_start(lens, seed)
-    fitted = fit.dof(reference.image, image, filled, throw=False, **start)
+    fitted = fit.dof(reference.image, image, filled, throw=False, progress=True, **start)
     exr.write(out / "fitted.exr", {"": fitted.image, "depth": depth})
 
     pictures = {
@@ -272,7 +272,9 @@ def main() -> None:
     )
     edges = near_edges(depth, math.ceil(coc / 2))
     # Their memory would be that of one program for all passes, which nobody compiles.
-    measurements = tradeoff.measure(methods, reference.image, mask=edges, memory=False)
+    measurements = tradeoff.measure(
+        methods, reference.image, mask=edges, memory=False, progress=True
+    )
     title = f"{size} by {size} pixels, largest circle of confusion {coc:.0f} pixels"
     draw_chart(measurements, title, out / "chart.png")
 

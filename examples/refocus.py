@@ -1,14 +1,20 @@
-"""Refocus a photograph that has a depth for every pixel.
+"""Refocus a photograph or a rendering that has a depth for every pixel.
 
-Takes a colour picture and its depth, of an RGB-D camera say, and gives each pixel the circle of
-confusion that a lens of the given aperture would have. Writes for every focus a picture
-`focus_DEPTH.png`, with `focus_DEPTH.exr` beside it (linear light, the depth in use and the
-circles), and for all of them one figure, `refocus.png`.
+Takes an image and its depth and gives each pixel the circle of confusion that a lens of the
+given aperture would have. Writes for every focus an image `focus_DEPTH.png`, with
+`focus_DEPTH.exr` beside it (linear light, the depth in use and the circles), and for all of
+them one figure, `refocus.png`.
 
-Where the depth is missing (0, NaN or negative), it is filled along the row with the farther of
-the nearest known depths on either side, since what such a camera misses lies mostly in the
-shadow that a near thing casts on what is behind it; in a row that knows nothing, along the
-column.
+    refocus.py color.png depth.png                              16 bits, in millimetres
+    refocus.py color.jpg depth.png --depth-scale 1/5000         an RGB-D camera's own steps
+    refocus.py render.exr --layer ViewLayer                     Blender's multilayer EXR
+    refocus.py photo.jpg midas.npy --disparity --disparity-scale 0.01 --disparity-shift 0.1
+    refocus.py left.png disp0.pfm --disparity --focal 3979 --baseline 0.193 --offset 124
+    refocus.py color.exr distance.exr --ray --focal 800         along the ray, not the axis
+
+Files are known by what is in them, not by their names. Where the depth is missing (0, negative
+or NaN) it is filled as `jaxfx.depth.fill` says; inf, and the 1e10 and 65504 of renderers, is a
+sky.
 """
 
 import argparse
@@ -18,17 +24,13 @@ from io import BytesIO
 from pathlib import Path
 
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from _begin import fail, make_folder
+from matplotlib.figure import Figure
 from tqdm.auto import tqdm
 
-from jaxfx import ThinLens, dof, exr, io
+from jaxfx import PinholeCamera, ThinLens, depth as depths, dof, exr, io
 from jaxfx._files import write_whole
-
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 
 METHODS = {
@@ -39,13 +41,24 @@ METHODS = {
 LARGEST_COC = 0.025
 # Where no focal length is known: that of a field of view of 60 degrees across.
 FOCAL_PER_WIDTH = 0.5 / math.tan(math.radians(30))
+# What one step of a file of integers is where nothing is said: a thousandth of a scene unit.
+MILLI = 1e-3
+
+
+def number(text: str) -> float:
+    """Any number, as 0.0002 or as 1/5000."""
+    try:
+        value = float(Fraction(text))
+    except (ValueError, ZeroDivisionError):
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from None
+    return value
 
 
 def positive(text: str) -> float:
     """A number above 0, as 0.0002 or as 1/5000."""
     try:
-        value = float(Fraction(text))
-    except (ValueError, ZeroDivisionError):
+        value = number(text)
+    except argparse.ArgumentTypeError:
         value = math.nan
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
@@ -68,11 +81,13 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("color", type=Path, help="PNG (sRGB) or EXR (linear), height by width")
+    add("color", type=Path, help="PNG or JPEG (sRGB) or EXR (linear)")
     add(
         "depth",
         type=Path,
-        help="PNG or EXR of the same size; along the optical axis, not the ray",
+        nargs="?",
+        help="PNG, EXR, PFM, NPY or NPZ of the same size; without it COLOR is an EXR file that "
+        "has both",
     )
     add(
         "--focus",
@@ -80,78 +95,101 @@ def parse() -> argparse.Namespace:
         nargs="+",
         help="depths in scene units, or pixels X,Y; without it, the median depth",
     )
+    add("--layer", help="the layer of an EXR file that has several")
+    add("--behind", help="the layer of COLOR that shows what the first one hides")
     add("--aperture", type=positive, help="diameter of the lens, scene units")
+    add("--focal", type=positive, help="focal length in pixels; without it, 60 degrees across")
     add(
         "--depth-scale",
         type=positive,
-        help="scene units of one step of the depth file, 1/5000 say; without it, 1/1000 for "
-        "PNG (millimetres to metres) and 1 for EXR",
+        help="scene units of one step of DEPTH (of a pair's disparity: pixels), 1/5000 say; "
+        "without it, 1/1000 for a depth in integers, else 1",
     )
-    add("--focal", type=positive, help="focal length in pixels; without it, 60 degrees across")
+    add("--ray", action="store_true", help="DEPTH is the distance along each pixel's ray")
+    add("--disparity", action="store_true", help="DEPTH is a disparity, larger where nearer")
+    add("--disparity-scale", type=number, help="1 / depth for a step of the disparity")
+    add("--disparity-shift", type=number, default=0.0, help="1 / depth where it is 0")
+    add("--baseline", type=positive, help="of a pair of cameras, scene units; needs --focal")
+    add("--offset", type=number, default=0.0, help="the pair's `doffs`, pixels")
+    add("--fill", choices=("guided", "rows"), default="guided", help="how holes are filled")
     add("--max-coc", type=positive, help="largest circle of confusion, pixels")
     add("--method", choices=METHODS, default="layered", help="how sprites meet at a pixel")
     add("--out", type=Path, default=Path("out"), help="folder to write to")
     return parser.parse_args()
 
 
-def read_color(path: Path) -> np.ndarray:
-    """Linear light, height width 1 or 3, float32."""
-    if path.suffix.lower() == ".exr":
-        channels = exr.read(path)
-        if "" not in channels:
-            raise ValueError(f"`{path}` must have channels R, G, B, got {[*channels]}.")
-        image = channels[""].astype(np.float32)
-    else:
-        image = io.read_png(path)
+def colors(image: np.ndarray) -> np.ndarray:
+    """An image without its alpha."""
     return image[..., : 3 if image.shape[2] > 2 else 1]
 
 
-def read_depth(path: Path, scale: float | None) -> np.ndarray:
-    """Scene units, height width, float32; what is missing is NaN."""
-    if path.suffix.lower() == ".exr":
-        planes = [a for name, a in exr.read(path).items() if name == "depth" or a.ndim == 2]
-        if not planes:
-            raise ValueError(f"`{path}` must have a channel Z or one of two dimensions.")
-        values, scale = planes[0], scale or 1.0
+def read_depth(arguments: argparse.Namespace) -> np.ndarray:
+    """Scene units along the axis, height width, float32; what is missing is NaN."""
+    stored = io.read_depth(arguments.depth)
+    is_depth = not arguments.disparity
+    scale = arguments.depth_scale or (MILLI if is_depth and stored.dtype.kind in "iu" else 1.0)
+    if is_depth:
+        found = depths.clean(stored, scale=scale)
+    elif arguments.baseline and arguments.focal:
+        found = depths.from_stereo(
+            stored * np.float32(scale),
+            focal_pixels=arguments.focal,
+            baseline=arguments.baseline,
+            offset=arguments.offset,
+        )
+    elif arguments.disparity_scale and not arguments.baseline:
+        found = depths.from_disparity(
+            stored * np.float32(scale),
+            scale=arguments.disparity_scale,
+            shift=arguments.disparity_shift,
+        )
     else:
-        from PIL import Image, UnidentifiedImageError
-
-        try:
-            with Image.open(path, formats=("PNG",)) as picture:
-                values = np.asarray(picture)
-        except (UnidentifiedImageError, SyntaxError) as error:
-            raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
-        scale = scale or 1e-3
-    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
-    if values.ndim != 2:
-        raise ValueError(f"`{path}` must have one channel of depth, got shape {values.shape}.")
-    depth = values.astype(np.float32) * np.float32(scale)
-    return np.where(depth > 0, depth, np.float32(np.nan))
+        raise ValueError(
+            "--disparity must have --disparity-scale, or --baseline and --focal of a pair"
+        )
+    return np.asarray(found, np.float32)
 
 
-def filled(depth: np.ndarray) -> np.ndarray:
-    """The depth without holes, by the rule that the module's docstring states."""
-    known = ~np.isnan(depth)
-    if not known.any():
-        raise ValueError("the depth must be known somewhere, got none above 0")
-    along_rows = _farther_end(depth)
-    along_columns = _farther_end(along_rows.T).T
-    return np.where(known, depth, np.where(np.isnan(along_rows), along_columns, along_rows))
+def read(arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+    """The image and its depth, with holes."""
+    if arguments.depth is None:
+        image, depth = exr.read_rgbd(arguments.color, layer=arguments.layer)
+        scale = arguments.depth_scale or 1.0
+        if arguments.disparity:
+            raise ValueError("--disparity must have a file DEPTH of its own")
+        depth = np.asarray(depths.clean(depth, scale=scale))
+    else:
+        image = io.read_color(arguments.color, layer=arguments.layer)
+        depth = read_depth(arguments)
+    if depth.shape != image.shape[:2]:
+        raise ValueError(
+            f"both files must have one height and width, got {image.shape[:2]} and "
+            f"{depth.shape}"
+        )
+    return colors(image), depth
 
 
-def _farther_end(depth: np.ndarray) -> np.ndarray:
-    """In each gap of a row, the larger of the depths at its two ends; NaN in an empty row."""
-    known = ~np.isnan(depth)
-    column = np.arange(depth.shape[1])
-    before = np.maximum.accumulate(np.where(known, column, -1), axis=1)
-    behind = np.where(known, column, depth.shape[1])[:, ::-1]
-    behind = np.minimum.accumulate(behind, axis=1)[:, ::-1]
-    ends = [
-        np.where(inside, np.take_along_axis(depth, np.where(inside, end, 0), axis=1), -np.inf)
-        for end, inside in ((before, before >= 0), (behind, behind < depth.shape[1]))
-    ]
-    larger = np.maximum(*ends)
-    return np.where(np.isneginf(larger), np.float32(np.nan), larger)
+def along_axis(depth: np.ndarray, focal: float) -> np.ndarray:
+    """The depth of a distance along the rays of a camera that looks at the image's middle."""
+    height, width = depth.shape
+    matrix = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    return np.asarray(depths.from_ray_distance(depth, PinholeCamera(matrix, np.eye(4))))
+
+
+def read_behind(arguments: argparse.Namespace, shape: tuple[int, ...]) -> tuple | None:
+    """A second layer of COLOR, for `layered`; None where none is asked for."""
+    if arguments.behind is None:
+        return None
+    if arguments.method != "layered":
+        raise ValueError(f"--behind must have --method layered, got {arguments.method}")
+    image, depth = exr.read_rgbd(arguments.color, layer=arguments.behind)
+    if depth.shape != shape:
+        raise ValueError(
+            f"--behind must have the first layer's size {shape}, got {depth.shape}"
+        )
+    depth = np.asarray(depths.clean(depth, scale=arguments.depth_scale or 1.0))
+    # What the second layer does not know hides nothing.
+    return colors(image), np.where(np.isnan(depth), np.float32(np.inf), depth)
 
 
 def focus_depth(chosen: float | tuple[int, int], depth: np.ndarray) -> float:
@@ -160,7 +198,7 @@ def focus_depth(chosen: float | tuple[int, int], depth: np.ndarray) -> float:
     x, y = chosen
     height, width = depth.shape
     if not (0 <= x < width and 0 <= y < height):
-        raise ValueError(f"--focus must lie in the {width} x {height} picture, got {x},{y}")
+        raise ValueError(f"--focus must lie in the {width} x {height} image, got {x},{y}")
     return float(depth[y, x])
 
 
@@ -170,31 +208,32 @@ def widest(depth: np.ndarray, distance: float, focal: float, width: int) -> floa
     return LARGEST_COC * width / (focal * max(unit, 1e-6))
 
 
-def save_figure(pictures: dict, depth, missing, path: Path) -> None:
-    """The photograph, its depth with what was missing, and every picture."""
-    count = 2 + len(pictures)
-    columns = min(count, 3)
-    rows = -(-count // columns)
+def save_figure(images: dict, depth: np.ndarray, filled: np.ndarray, path: Path) -> None:
+    """The photograph, its depth with what was missing, and every image; no place is blank."""
+    count = 1 + len(images)
+    columns = next(c for c in (3, 4, 2, count) if count % c == 0)
+    rows = count // columns
     height, width = depth.shape
-    size = (5 * columns, (5 * height / width + 0.35) * rows)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=size, layout="constrained", squeeze=False
-    )
-    axes = list(axes.flat)
-    for ax, (title, picture) in zip(axes[:1] + axes[2:], pictures.items(), strict=False):
-        ax.imshow(io.srgb_from_linear(np.clip(picture, 0, 1)), cmap="gray")
+    # As wide as high images need to be, and the depth's scale beside them.
+    size = (4.6 * columns + 0.6, (4.6 * height / width + 0.45) * rows)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for ax, (title, image) in zip(axes[:1] + axes[2:], images.items(), strict=True):
+        ax.imshow(io.srgb_from_linear(np.clip(image, 0, 1)), cmap="gray")
         ax.set_title(title)
-    shown = axes[1].imshow(depth, cmap="viridis")
-    figure.colorbar(shown, ax=axes[1], label="scene units")
+    finite = depth[np.isfinite(depth)]
+    span = (finite.min(), finite.max()) if finite.size else (0, 1)
+    shown = axes[1].imshow(depth, cmap="viridis", vmin=span[0], vmax=span[1])
+    figure.colorbar(shown, ax=axes[1], label="scene units", shrink=0.8)
     marks = np.zeros((*depth.shape, 4))
-    marks[missing] = (1, 0, 0, 0.6)
+    marks[filled] = (1, 0, 0, 0.6)
     axes[1].imshow(marks)
-    axes[1].set_title(f"depth; {missing.mean():.0%} was missing, red")
+    sky = "; the sky is white" if finite.size < depth.size else ""
+    axes[1].set_title(f"depth; {filled.mean():.0%} was missing, red{sky}")
     for ax in axes:
         ax.set_axis_off()
     buffer = BytesIO()
     figure.savefig(buffer, dpi=110)
-    plt.close(figure)
     write_whole(path, buffer.getvalue())
 
 
@@ -202,35 +241,35 @@ def main() -> None:
     arguments = parse()
     out = make_folder(arguments.out)
     try:
-        color = read_color(arguments.color)
-        measured = read_depth(arguments.depth, arguments.depth_scale)
-        if measured.shape != color.shape[:2]:
-            raise ValueError(
-                f"both pictures must have one height and width, got {color.shape[:2]} and "
-                f"{measured.shape}"
-            )
-        depth = filled(measured)
+        color, depth = read(arguments)
+        behind = read_behind(arguments, depth.shape)
+        width = depth.shape[1]
+        focal = arguments.focal or FOCAL_PER_WIDTH * width
+        if arguments.ray:
+            depth = along_axis(depth, focal)
+        whole = depths.fill(depth, color, method=arguments.fill)
+        depth, filled = np.asarray(whole.depth), np.asarray(whole.filled)
         chosen = arguments.focus or [float(np.median(depth))]
         distances = [focus_depth(each, depth) for each in chosen]
     except (OSError, ValueError) as error:
         fail(error)
 
-    width = depth.shape[1]
-    focal = arguments.focal or FOCAL_PER_WIDTH * width
-    pictures = {"photograph": color}
+    images = {"photograph": color}
+    options = {} if behind is None else {"behind": behind}
     for distance in tqdm(distances, "focus", leave=False):
         aperture = arguments.aperture or widest(depth, distance, focal, width)
         lens = ThinLens(aperture, distance, focal)
         circles = np.asarray(lens.circle_of_confusion(jnp.asarray(depth)))
         max_coc = arguments.max_coc or max(float(circles.max()), 1.0)
-        image = np.asarray(METHODS[arguments.method](color, depth, lens, max_coc=max_coc))
-        name = f"focus_{distance:.3g}"
+        method = METHODS[arguments.method]
+        image = np.asarray(method(color, depth, lens, max_coc=max_coc, **options))
+        name = f"focus_{distance:.5g}"
         exr.write(out / f"{name}.exr", {"": image, "depth": depth, "coc": circles})
         io.write_png(out / f"{name}.png", image)
         largest = min(max_coc, float(circles.max()))
-        pictures[f"focus at {distance:.3g}, circles up to {largest:.0f} pixels"] = image
-    save_figure(pictures, depth, np.isnan(measured), out / "refocus.png")
-    print(f"pictures in {out}")
+        images[f"focus at {distance:.3g}, circles up to {largest:.0f} pixels"] = image
+    save_figure(images, depth, filled, out / "refocus.png")
+    print(f"images in {out}")
 
 
 if __name__ == "__main__":

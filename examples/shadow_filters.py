@@ -165,7 +165,7 @@ def draw_steps(stage: Stage, size: int, visible, where, path: Path) -> None:
     bias = {"bias": stage.bias, "slope_bias": size / 2}
     data = stage.shadow_map, stage.receivers
     hard = stage.picture(shadow.hard(*data, **bias))
-    edges = shadow.candidates(*data, size=size, dilation=1, **bias).where
+    edges = shadow.candidates(*data, size=size, mask="screen", dilation=1, **bias).where
     steps = {
         "hard shadow": hard,
         "its edges": marked(hard, np.asarray(edges)),

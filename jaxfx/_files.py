@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Files written whole or not at all, under names that say what they are."""
 
 import os
 import secrets
@@ -6,6 +6,13 @@ from pathlib import Path
 
 
 StrPath = str | os.PathLike[str]
+
+
+def check_suffix(name: str, path: StrPath, suffix: str) -> None:
+    """Raise `ValueError` if `path` ends in the suffix of another format."""
+    found = Path(path).suffix
+    if found and found.lower() != suffix:
+        raise ValueError(f"`{name}` must end in `{suffix}`, the format, got `{path}`.")
 
 
 def write_whole(path: StrPath, data: bytes | bytearray | memoryview) -> None:

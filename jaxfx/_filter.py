@@ -81,6 +81,8 @@ def _transposed(
 
 def folded(wide: Float[Array, "H W c"], margin: int) -> Float[Array, "h w c"]:
     """The transpose of a margin that repeats the border: the sum of what is beyond it."""
+    if margin == 0:
+        return wide  # of one row, say, which would be first and last
     for axis in (0, 1):
         first, inside, last = jnp.split(wide, (margin + 1, wide.shape[axis] - margin - 1), axis)
         ends = (jnp.sum(end, axis, keepdims=True) for end in (first, last))

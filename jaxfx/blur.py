@@ -17,6 +17,7 @@ from jaxfx._checks import (
     as_array,
     check,
     check_image,
+    is_concrete,
     option,
     parameter,
     whole_number,
@@ -37,12 +38,14 @@ __all__ = ["binomial_weights", "downsample", "gaussian", "linear_taps"]
 
 # A variance below this, in pixels squared, is this: no neighbour's weight exceeds e**-500.
 _SMALLEST_VARIANCE = 1e-3
+# Of binomial weights, by default; and of a standard deviation, how often it is to each side.
+_TAPS, _DEVIATIONS = 9, 4
 
 
 def gaussian(
     image: Float[ArrayLike, "height width channel"],
     *,
-    taps: WholeNumber = 9,
+    taps: WholeNumber | None = None,
     passes: WholeNumber = 1,
     sampling: Sampling = "discrete",
     sigma: Float[ArrayLike, ""] | float | None = None,
@@ -58,16 +61,19 @@ def gaussian(
     **Arguments:**
 
     - `image`: height width channel, any unit; linear radiance is what light adds up in.
-    - `taps`: static; how many pixels one pass reads along an axis, odd.
+    - `taps`: static; how many pixels one pass reads along an axis, odd. By default 9 for
+      binomial weights and, with `sigma`, as many as reach 4 standard deviations of one pass to
+      each side: beyond lie 6e-5 of a Gaussian. A traced `sigma`, under `jit`, `grad` or `vmap`,
+      can't set them: then they must be given.
     - `passes`: static; how often the pair of passes is done.
     - `sampling`: "discrete", a tap a read; or "linear", two neighbouring taps as one read in
       between, as `linear_taps` places it: equal to rounding. For texture units; XLA has none,
       and reads the same pixels for it.
     - `sigma`: pixels, the standard deviation of the whole blur, all passes together; 0 is the
-      identity. Weights beyond the taps are dropped: from some `sigma = sqrt(passes) * taps / 5`
-      on the blur is weaker than asked for, and it tends to that of equal weights,
-      `sqrt(passes * (taps**2 - 1) / 12)` pixels. Below 0.6 pixels a pass, too, it is weaker:
-      there is little between a pixel and the next.
+      identity. Weights beyond given taps are dropped: from some
+      `sigma = sqrt(passes) * taps / 5` on the blur is weaker than asked for, and it tends to
+      that of equal weights, `sqrt(passes * (taps**2 - 1) / 12)` pixels. Below 0.6 pixels a
+      pass, too, it is weaker: there is little between a pixel and the next.
     - `row`: static; without `sigma`, the row of Pascal's triangle, of even index. By default
       `taps + 3`: the outer two on either side dropped, 66, 220, 495, 792, 924, ... for 9 taps.
 
@@ -75,8 +81,8 @@ def gaussian(
     what the taps of all passes can reach, `passes * (taps // 2)` pixels along either axis.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, an even or non-positive
-    `taps`, `passes` below 1, a negative `sigma`, a `row` too short, `sigma` and `row` together,
-    or an unknown `sampling`.
+    `taps`, `passes` below 1, a negative `sigma`, a traced or infinite `sigma` without `taps`, a
+    `row` too short, `sigma` and `row` together, or an unknown `sampling`.
 
     **Gradient:** exact with respect to `image` and `sigma`; at `sigma` 0 it is 0 in `sigma`,
     which is the limit.
@@ -87,19 +93,36 @@ def gaussian(
     image = check_image("gaussian(image)", image)
     # An even kernel lies between pixels: `downsample` has it.
     is_odd = lambda n: n >= 1 and n % 2 == 1
-    taps = whole_number("gaussian(taps=...)", taps, is_odd, "an odd positive integer")
+    if taps is not None:
+        taps = whole_number("gaussian(taps=...)", taps, is_odd, "an odd positive integer")
     passes = whole_number("gaussian(passes=...)", passes)
     option("gaussian(sampling=...)", sampling, get_args(Sampling))
     if sigma is None:
+        taps = _TAPS if taps is None else taps
         weights = _binomial("gaussian", taps, taps + 3 if row is None else row)
         return _binomial_blur(image, jnp.asarray(weights), passes, sampling)
     if row is not None:
         raise ValueError(
             f"`gaussian(row=...)` must be left out where `sigma` is given, got {row}."
         )
-    sigma = parameter("gaussian(sigma=...)", sigma)
-    check("gaussian(sigma=...)", sigma, lambda v: v >= 0, "0 or positive")
-    return _gaussian_blur(image, sigma, taps, passes, sampling)
+    deviation = parameter("gaussian(sigma=...)", sigma)
+    check("gaussian(sigma=...)", deviation, lambda v: v >= 0, "0 or positive")
+    taps = _taps_of(sigma, passes) if taps is None else taps
+    return _gaussian_blur(image, deviation, taps, passes, sampling)
+
+
+def _taps_of(sigma: Any, passes: int) -> int:
+    """How many taps a pass needs, for all passes to have the standard deviation `sigma`."""
+    if not is_concrete(sigma):
+        raise ValueError(
+            "`gaussian(taps=...)` must be given under `jit`, `grad` and `vmap`, where a traced "
+            "`sigma` can't set it: static, `8 * sigma / sqrt(passes) + 1` pixels for the "
+            "largest `sigma`, and odd, got None."
+        )
+    reach = _DEVIATIONS * float(np.asarray(sigma)) / math.sqrt(passes)
+    if not math.isfinite(reach):
+        raise ValueError(f"`gaussian(sigma=...)` must be finite without `taps`, got {sigma}.")
+    return 2 * math.ceil(reach) + 1
 
 
 def binomial_weights(taps: WholeNumber, *, row: WholeNumber) -> Float[Array, "taps"]:

@@ -16,10 +16,11 @@ import jax.stages
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from tqdm.auto import tqdm
 
 from jaxfx import metrics
+from jaxfx._extras import needs
 from jaxfx._files import StrPath, write_whole
+from jaxfx._progress import counted
 
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def measure(
     repeats: int = 7,
     max_seconds: float = 2.0,
     memory: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> list[Measurement]:
     """Time and accuracy of every method, one after another in one process.
 
@@ -82,7 +83,7 @@ def measure(
       program that `jax.jit` makes of it, what it closes over counted as arguments. A method
       that can't be traced has none to know. One that is compiled already, a
       `functools.partial` of what `jax.jit(f).lower(...).compile()` gave, is only asked.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a list of `Measurement`, in the order of `methods`.
 
@@ -94,7 +95,7 @@ def measure(
         raise ValueError("`measure(methods)` must hold at least one method, got none.")
     reference = jax.numpy.asarray(reference)
     measurements = []
-    for name, method in tqdm(methods.items(), "measure", disable=not progress, leave=False):
+    for name, method in counted(methods.items(), progress, "measure"):
         image, first = _timed(method)
         if image.shape != reference.shape:
             raise ValueError(
@@ -253,7 +254,8 @@ def plot(
 
 def _scale(ax: "Axes", costs: Sequence[float]) -> None:
     """Logarithmic, or linear below the smallest if there is a 0; with plain numbers."""
-    from matplotlib.ticker import LogLocator
+    with needs("plot"):
+        from matplotlib.ticker import LogLocator
 
     if 0 in costs:
         least = min((x for x in costs if x > 0), default=1.0)
@@ -353,7 +355,8 @@ def save(figure: "Figure", path: StrPath) -> None:
 
     **Gradient:** none: it writes a file.
     """
-    import matplotlib
+    with needs("plot"):
+        import matplotlib
 
     kind = Path(path).suffix.removeprefix(".")
     known = figure.canvas.get_supported_filetypes()

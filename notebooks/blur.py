@@ -84,15 +84,16 @@ print(*(f"{float(jnp.mean(x)):.4f}" for x in (image, kept, darkened)))
 # ## Sigma, to be fitted
 #
 # `sigma` is a parameter as any other: traced, with a derivative, in pixels and of all passes
-# together. Here it is found again from a blurred picture by Newton's method.
+# together. A number sets the taps too, 4 sigma to each side; a traced one can't, so that they
+# are given. Here it is found again from a blurred picture by Newton's method.
 
 # %%
-blurred = blur.gaussian(image, sigma=1.7)
+blurred = blur.gaussian(image, taps=15, sigma=1.7)
 
 
 @jax.jit
 def loss(sigma):
-    return jnp.sum((blur.gaussian(image, sigma=sigma) - blurred) ** 2)
+    return jnp.sum((blur.gaussian(image, taps=15, sigma=sigma) - blurred) ** 2)
 
 
 sigma = jnp.float32(1.3)
@@ -101,8 +102,8 @@ for _ in range(5):
     print(f"{float(sigma):.5f}", end="  ")
 
 # %% [markdown]
-# The tap count is static, and what it can't hold is dropped: 9 taps give a standard deviation
-# of 2.58 pixels at the most, that of equal weights. More passes hold more.
+# The tap count is static, and what given taps can't hold is dropped: 9 taps give a standard
+# deviation of 2.58 pixels at the most, that of equal weights. More passes hold more.
 
 # %%
 asked = np.linspace(0, 6, 61)

@@ -34,10 +34,9 @@ from jaxfx import ThinLens, dof, metrics, reproject, tradeoff
 
 
 # The command that measured, whichever folder this runs in.
-root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "examples").is_dir())
-sys.path.append(str(root / "examples"))
-import atlas
-import atlas_cases
+root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks").is_dir())
+sys.path.append(str(root))
+from benchmarks import atlas, atlas_cases
 
 
 set_matplotlib_formats("png")
@@ -171,7 +170,7 @@ for method in atlas_cases.SEARCHES:
 
 # %% [markdown]
 # - **Another machine.** Ratios of times change with cores, caches and memory, and a GPU would
-#   turn some of them round. The margin says where a chart is from; `python examples/atlas.py`
+#   turn some of them round. The margin says where a chart is from; `python -m benchmarks.atlas`
 #   draws it anew in under ten minutes.
 # - **Another scene.** Two were measured, one of them made to fail. Which is like yours is not
 #   on the chart; `budget` asks your scene itself.

@@ -32,8 +32,8 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 from jaxfx import PinholeCamera, ThinLens, dof, io, metrics, relight, scene, tradeoff
 
 
-sys.path.append("../tests/benchmarks")
-import dof_cases
+sys.path.append("..")
+from benchmarks.scenes import dof as dof_cases
 
 
 plt.rcParams["figure.dpi"] = 80

@@ -36,9 +36,9 @@ from jaxfx import GBuffer, PinholeCamera, PointLight, io, metrics, relight, scen
 
 
 # The scenes that the benchmarks use, whichever folder this runs in.
-root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "tests/benchmarks").is_dir())
-sys.path.append(str(root / "tests/benchmarks"))
-import relight_scenes
+root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks").is_dir())
+sys.path.append(str(root))
+from benchmarks.scenes import relight as relight_scenes
 
 
 set_matplotlib_formats("jpeg", pil_kwargs={"quality": 80})
@@ -338,7 +338,7 @@ pictures(
 # Mitsuba's direct light on the same meshes, every surface Lambert, under a directional, a point
 # and a spot light; one ray through each pixel's centre. But for pixels whose centre lies on an
 # edge the two are the same to rounding; unfiltered shadow maps miss the rims of shadows by
-# their texels. `python tests/benchmarks/relight_charts.py --out docs` makes this picture and
+# their texels. `python -m benchmarks.relight_charts --out docs` makes this picture and
 # the next chart.
 
 # %%

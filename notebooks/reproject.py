@@ -34,8 +34,8 @@ from jaxfx._pyramid import minimum_pyramid
 from jaxfx.reproject import _grid, _walk
 
 
-sys.path.append("../tests/benchmarks")
-import reproject_cases as cases
+sys.path.append("..")
+from benchmarks.scenes import reproject as cases
 
 
 plt.rcParams["figure.dpi"] = 80

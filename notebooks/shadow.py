@@ -33,9 +33,9 @@ from jaxfx import AmbientLight, DirectionalLight, PointLight, fit, io, relight, 
 
 
 # The scenes that the tests and benchmarks use, whichever folder this runs in.
-root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "tests/benchmarks").is_dir())
-sys.path.append(str(root / "tests/benchmarks"))
-import shadow_scenes
+root = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "benchmarks").is_dir())
+sys.path.append(str(root))
+from benchmarks.scenes import shadow as shadow_scenes
 
 
 set_matplotlib_formats("jpeg", pil_kwargs={"quality": 80})
@@ -74,9 +74,10 @@ SIZE = 7
 bias = {"bias": 0.005, "slope_bias": SIZE / 2}
 hard, full = shadow.hard(*data, **bias), shadow.pcf(*data, size=SIZE, **bias)
 edges, dilated = (
-    shadow.candidates(*data, size=SIZE, dilation=d, **bias).where for d in (1, SIZE // 2 + 1)
+    shadow.candidates(*data, size=SIZE, mask="screen", dilation=d, **bias).where
+    for d in (1, SIZE // 2 + 1)
 )
-exact = shadow.candidates(*data, size=SIZE, mask="depth", **bias)
+exact = shadow.candidates(*data, size=SIZE, **bias)
 pictures(
     {
         "one comparison": shaded(hard),
@@ -92,16 +93,16 @@ pictures(
 )
 
 # %% [markdown]
+# - `mask="depth"`, the default, asks the smallest and the largest texel under the filter, a
+#   running minimum and maximum of the map. If both say the same, all do. It can't miss: the
+#   result is `pcf`'s to the last bit.
 # - `mask="screen"` (Yu & Choi) filters near the edges of the hard shadow.
-# - `mask="depth"` asks the smallest and the largest texel under the filter, a running minimum
-#   and maximum of the map. If both say the same, all do. It can't miss: the result is `pcf`'s
-#   to the last bit.
 #
 # Of $I$ pixels $B$ are filtered: $I + BF$ comparisons instead of $IF$, $F = n^2$; the mask by
 # depth makes $I$ more.
 
 # %%
-masked = shadow.edge_pcf(*data, size=SIZE, mask="depth", **bias)
+masked = shadow.edge_pcf(*data, size=SIZE, **bias)
 print(f"bits that differ: {int(jnp.sum(masked != full))}")
 for name, found, tests in (("depth", exact.where, 2), ("screen", dilated, 1)):
     count = tests * found.size + int(found.sum()) * SIZE**2
@@ -113,12 +114,12 @@ assert int(exact.comparisons) == 2 * exact.where.size + int(exact.where.sum()) *
 # ## Time against the size of the filter
 #
 # $512^2$ receivers, float32, 3 to 5 % of them in a penumbra. The times were measured on two
-# idle cores by `tests/benchmarks/shadow_growth.py` and are read from its file: here, beside
+# idle cores by `benchmarks/shadow_growth.py` and are read from its file: here, beside
 # other work, they would be noise.
 
 # %%
 times = {}
-with open(root / "tests/benchmarks/shadow_growth.csv") as file:
+with open(root / "docs/shadow_growth.csv") as file:
     for row in csv.DictReader(file):
         times.setdefault(row["method"], {})[int(row["size"])] = float(row["milliseconds"])
 figure, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
@@ -140,8 +141,8 @@ for name in ("screen mask", "depth mask", "variance"):
 #
 # Embree traces one ray from each point to the light: a sun, and a point light with its six
 # maps. The mean error of visibility, over surfaces that the light does not graze, by the side
-# of a map and by the bias. Filters need more bias, $n/2$ texels of slope, and blur what is
-# sharp here: their error is larger.
+# of a map and by the bias. Filters need more bias, $n/2$ texels of slope, which is their
+# default, and blur what is sharp here: their error is larger.
 
 # %%
 still = shadow_scenes.Still()
@@ -250,10 +251,8 @@ for magnification in (0.25, 0.5, 1, 2, 4, 8):
     case = shadow_scenes.plate(magnification, 4)
     sharp, soft = shadow.hard(*case), shadow.pcf(*case, size=SIZE)
     soft_pixels = np.asarray(soft != sharp)
-    missed = [
-        np.mean(~np.asarray(shadow.candidates(*case, size=SIZE, dilation=r).where)[soft_pixels])
-        for r in reaches
-    ]
+    found = (shadow.candidates(*case, size=SIZE, mask="screen", dilation=r) for r in reaches)
+    missed = [np.mean(~np.asarray(each.where)[soft_pixels]) for each in found]
     ax.semilogx(reaches, missed, ".-", label=f"{magnification}")
 ax.set(xlabel="dilation, pixels", ylabel="share missed")
 ax.minorticks_off()
@@ -277,8 +276,8 @@ pictures(
     {
         "one comparison": shadow.hard(far, seen),
         "pcf 7 x 7": shadow.pcf(far, seen, size=SIZE),
-        'mask="screen"': shadow.edge_pcf(far, seen, size=SIZE, dilation=1),
-        'mask="depth"': shadow.edge_pcf(far, seen, size=SIZE, mask="depth"),
+        'mask="screen"': shadow.edge_pcf(far, seen, size=SIZE, mask="screen", dilation=1),
+        'mask="depth"': shadow.edge_pcf(far, seen, size=SIZE),
     },
     4,
     cmap="gray",

@@ -158,8 +158,32 @@ def test_scipys_gaussian():
     np.testing.assert_allclose(out[..., 0], expected, rtol=1e-13)
 
 
-def spread_of(sigma, taps, passes=1):
-    reach = passes * (taps // 2)
+@pytest.mark.parametrize("passes", [1, 4])
+@pytest.mark.parametrize("sigma", [3.0, 10.0, np.float32(10), jnp.asarray(10.0)])
+def test_a_sigma_alone_sets_the_taps(sigma, passes):
+    """As wide as asked for, but for what lies beyond 4 standard deviations."""
+    expected = float(sigma)
+    assert spread_of(sigma, None, passes, reach=80) == pytest.approx(expected, rel=2e-3)
+    # Inside of another trace, too, where it is closed over.
+    image = picture(9, 12)
+    compiled = jax.jit(lambda image: blur.gaussian(image, sigma=sigma, passes=passes))(image)
+    expected_image = blur.gaussian(image, sigma=sigma, passes=passes)
+    np.testing.assert_allclose(compiled, expected_image, rtol=1e-6)
+    taps = 2 * math.ceil(4 * expected / passes**0.5) + 1
+    given = blur.gaussian(image, sigma=sigma, passes=passes, taps=taps)
+    np.testing.assert_array_equal(expected_image, given)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 3)])
+def test_a_sigma_of_0_alone_is_the_identity(size):
+    image = jnp.asarray(picture(*size))
+    out, pull = jax.vjp(lambda image: blur.gaussian(image, sigma=0.0), image)
+    np.testing.assert_array_equal(out, image)
+    np.testing.assert_array_equal(pull(image)[0], image)
+
+
+def spread_of(sigma, taps, passes=1, reach=None):
+    reach = passes * (taps // 2) if reach is None else reach
     point = np.zeros((1, 2 * reach + 1, 1))
     point[0, reach] = 1
     out = blur.gaussian(point, taps=taps, passes=passes, sigma=sigma)
@@ -187,7 +211,7 @@ def test_sigma_0_is_the_identity_with_a_gradient_of_0(sampling):
 
     @jax.jit
     def both(sigma):
-        blurred = lambda sigma: blur.gaussian(image, sampling=sampling, sigma=sigma)
+        blurred = lambda sigma: blur.gaussian(image, taps=9, sampling=sampling, sigma=sigma)
         return jax.jvp(blurred, (sigma,), (jnp.ones_like(sigma),))
 
     for sigma in (0.0, 1e-30, 1e-3, 0.02):
@@ -201,7 +225,7 @@ def test_gradients_in_sigma_and_the_image_are_differences():
 
     @jax.jit
     def loss(image, sigma):
-        return jnp.sum(bar * blur.gaussian(image, passes=2, sigma=sigma) ** 2)
+        return jnp.sum(bar * blur.gaussian(image, taps=9, passes=2, sigma=sigma) ** 2)
 
     by_image, by_sigma = jax.jit(jax.grad(loss, argnums=(0, 1)))(image, jnp.asarray(1.3))
     difference = (loss(image, 1.3 + 1e-5) - loss(image, 1.3 - 1e-5)) / 2e-5
@@ -273,11 +297,17 @@ def test_faults_are_named():
         ({"passes": 0}, r"`gaussian\(passes=...\)` must be a positive integer, got 0"),
         ({"sampling": "cubic"}, r"`gaussian\(sampling=...\)` must be one of .* got 'cubic'"),
         ({"sigma": -1.0}, r"`gaussian\(sigma=...\)` must be 0 or positive, got -1.0"),
+        (
+            {"sigma": math.inf},
+            r"`gaussian\(sigma=...\)` must be finite without .* got inf",
+        ),
         ({"sigma": 1.0, "row": 12}, r"`gaussian\(row=...\)` must be left out .* got 12"),
         ({"row": 9}, r"`gaussian\(row=...\)` must be 8, 10, 12 .* got 9"),
     ]:
         with pytest.raises(ValueError, match=message):
             gaussian(image, **options)
+    with pytest.raises(ValueError, match=r"`gaussian\(taps=...\)` must be given under `jit`"):
+        jax.jit(lambda sigma: gaussian(image, sigma=sigma))(2.0)
     with pytest.raises(ValueError, match=r"`gaussian\(image\)` must be an image of shape"):
         gaussian(image[0])
     with pytest.raises(ValueError, match=r"`downsample\(taps=...\)` must be even .* got 3"):

@@ -12,6 +12,8 @@ import pytest
 from jaxfx import ThinLens, dof, shadow
 
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 SIDE = 64
 
 

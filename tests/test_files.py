@@ -1,6 +1,6 @@
 import pytest
 
-from jaxfx._files import write_whole
+from jaxfx._files import check_suffix, write_whole
 
 
 def test_a_file_is_replaced_once_it_is_complete(tmp_path):
@@ -30,3 +30,14 @@ def test_a_link_is_followed(tmp_path):
 def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(OSError, match=r"cannot write `a.bin` here"):
         write_whole(tmp_path / "no" / "a.bin", b"new")
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.PNG", "folder.x/a", "a"])
+def test_a_suffix_that_fits(name):
+    check_suffix("write(path)", name, ".png")
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png.gz", "a.exr"])
+def test_a_suffix_of_another_format(name):
+    with pytest.raises(ValueError, match=rf"`write\(path\)` must end in `.png`.* `{name}`"):
+        check_suffix("write(path)", name, ".png")

@@ -21,8 +21,11 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
-NUMERICS = {"_checks", "_filter", "_linear", "_numerics", "_tiles", "_pyramid", "_sampling"}
-TYPES = {"_arguments", "camera", "lens", "light", "gbuffer"}
+NUMERICS = {
+    *("_checks", "_extras", "_filter", "_holes", "_linear", "_numerics", "_progress"),
+    *("_pyramid", "_sampling", "_tiles"),
+}
+TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}
@@ -134,6 +137,25 @@ def test_every_value_error_opens_with_the_argument_at_fault(path):
     for start in _value_errors(TREES[path]):
         text = start.value if isinstance(start, ast.Constant) else ""
         assert text.startswith("`"), f"line {start.lineno}: {text!r}"
+
+
+# What belongs to the whole process, and so to its other threads too.
+PROCESS_WIDE = re.compile(
+    r"contextlib\.redirect_|sys\.std(out|err|in)\b|os\.(chdir|environ|putenv|umask|dup2)\b"
+    r"|warnings\.(filter|simple|catch|reset)|(np|numpy)\.(seterr|set_printoptions)"
+    r"|random\.seed|matplotlib\.(use|rc)|pyplot|config\.update|basicConfig|setlocale"
+    r"|signal\.signal|sys\.(path|setrecursionlimit)|gc\.(set|dis|en)"
+)
+# How PyOpenGL is told which library to load, before it is imported; and matplotlib, which no
+# two threads may use at once, which fonts to put into a file. Neither takes an argument.
+MAY_CHANGE_PROCESS = {"scene/_opengl.py": {"os.environ"}, "tradeoff.py": {"matplotlib.rc"}}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_process_wide_is_changed(path):
+    names = [n for n in ast.walk(TREES[path]) if isinstance(n, ast.Attribute | ast.alias)]
+    used = {match.group() for n in names if (match := PROCESS_WIDE.search(ast.unparse(n)))}
+    assert used <= MAY_CHANGE_PROCESS.get(path.relative_to(ROOT).as_posix(), set())
 
 
 # The public face: what `jaxfx` and the modules directly below it list in `__all__`.

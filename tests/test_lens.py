@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import check_slopes
 
 from jaxfx import FocusPlanes, Lens, OrthographicCamera, PinholeCamera, ThinLens
+from tests.helpers.quick import check_slopes
 
 
 LENS = ThinLens(0.1, 2.0, 100.0)
@@ -63,7 +63,7 @@ def test_from_sensor_is_the_cone_of_rays_through_a_fixed_sensor():
     focal_length, f_stop, focus, sensor, width = 0.05, 2.8, 2.6, 0.036, 1920
     lens = ThinLens.from_sensor(focal_length, f_stop, focus, sensor, width)
     for depth in (0.7, 2.6, 9.0):
-        # By similar triangles, so wide in the scene; then as the pinhole sees it.
+        # By similar triangles: the width of the cone there, in the scene, then in pixels.
         across = focal_length / f_stop * abs(depth - focus) / focus
         pixels = across / depth * focal_length / sensor * width
         coc = lens.circle_of_confusion(depth)

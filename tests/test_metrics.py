@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import check_slopes, quick_jit
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from jaxfx import metrics
+from tests.helpers.quick import check_slopes, quick_jit
 
 
 SKIMAGE = {

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx._pyramid import maximum_pyramid, minimum_pyramid
+from tests.helpers.quick import quick_jit
 
 
 SIZES = [(1, 1), (1, 2), (2, 3), (5, 1), (17, 5), (61, 64), (64, 257)]

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit, quickly
 
 import jaxfx
 import jaxfx.shadow
+from tests.helpers.quick import quick_jit, quickly
 
 
 # Not functions of arrays: the host side reads files and meshes; solvers, measurements and plans
@@ -38,6 +38,9 @@ HANDED_ON = {
     ("reproject.blend", "target"),
     ("reproject.choose", "target"),
 }
+
+# Options that a traced argument needs: the default serves concrete ones alone.
+NEEDED = {("blur.gaussian", "taps"): 9}
 
 # Searches that end off the surface whose derivative they take: it is not that of their error.
 ROUGH = {"descent", "linear", "relief"}
@@ -149,7 +152,7 @@ EXAMPLES = {
     "bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "slope_bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "size": [lambda rng, size: 3],
-    "dilation": [lambda rng, size: 2],
+    "dilation": [lambda rng, size: None, lambda rng, size: 2],
     "light_size": [lambda rng, size: np.array(rng.uniform(0.2, 0.3))],
     "min_variance": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "camera": [pinhole, orthographic],
@@ -172,6 +175,13 @@ EXAMPLES = {
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "behind": [lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size))],
+    "disparity": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "distance": [lambda rng, size: rng.uniform(1.1, 4, size)],
+    "scale": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "shift": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "focal_pixels": [lambda rng, size: np.array(rng.uniform(20, 30))],
+    "baseline": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "softness": [lambda rng, size: np.array(rng.uniform(1, 2))],
 }
 
@@ -276,6 +286,7 @@ def _cases(name, function):
     parameters = inspect.signature(function).parameters.values()
     choices = {p.name: _choices(p) for p in parameters}
     choices = {p: v[:1] if (name, p) in HANDED_ON else v for p, v in choices.items()}
+    choices |= {p: [NEEDED[name, p]] for p in choices if (name, p) in NEEDED}
     if missing := [f"an example for `{name}`" for name in choices if not choices[name]]:
         return {}, missing
     cases, missing = {}, {(p, i) for p, values in choices.items() for i in range(len(values))}
@@ -302,8 +313,15 @@ for _name, _function in FUNCTIONS.items():
 
 
 def each(cases):
-    """Parametrize by cases, so that a case's tests follow one another and share `program`."""
-    return pytest.mark.parametrize("case", cases.values(), ids=cases.keys(), scope="module")
+    """Parametrize by cases, so that a case's tests follow one another and share `program`.
+
+    The quick form of the suite takes the first case of each function: its default options.
+    """
+    values = [
+        pytest.param(case, id=name, marks=() if name in FUNCTIONS else pytest.mark.full)
+        for name, case in cases.items()
+    ]
+    return pytest.mark.parametrize("case", values, scope="module")
 
 
 @functools.lru_cache(maxsize=1)
@@ -341,6 +359,7 @@ def test_every_argument_and_choice_is_exercised(name):
 
 
 @each(CASES)
+@pytest.mark.full
 def test_jit(case):
     compiled, call, arguments = program(case)
     with quickly():
@@ -358,7 +377,9 @@ def test_vmap_is_a_loop(case):
 
 
 @each(CASES)
-@pytest.mark.parametrize("parameters", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "parameters", [np.float32, pytest.param(np.float64, marks=pytest.mark.full)]
+)
 def test_float32_stays_and_is_close_to_float64(case, parameters):
     call, arguments = case.split(dtype=np.float32, parameters=parameters)
     compiled, _, same = program(case)
@@ -410,6 +431,7 @@ PICTURES = {name: case for name, case in OPTIONS.items() if not name.startswith(
 
 
 @each(OPTIONS)
+@pytest.mark.full
 def test_nested_gradient_is_finite(case):
     call, arguments = case.split()
     along = _normal(arguments)
@@ -424,6 +446,7 @@ def test_nested_gradient_is_finite(case):
 
 @each(PICTURES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 7)], ids="{0[0]}x{0[1]}".format)
+@pytest.mark.full
 def test_any_size(case, size):
     call, arguments = case.split(size=size)
 

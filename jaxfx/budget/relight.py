@@ -18,7 +18,6 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import Light
 from jaxfx.relight.shading import Surface, check_shader, reflected, render, to_surface
-from jaxfx.relight.state import start
 
 
 # A light that is needed in more of the picture is computed in all of it: single pixels cost so
@@ -43,9 +42,7 @@ class Everything(eqx.Module):
 
     def __call__(self, gbuffer: Any, camera: Any, lights: Any, visibilities: Any = None) -> Any:
         """As the effect."""
-        if visibilities is None:
-            return render(gbuffer, camera, lights)
-        return start(gbuffer, camera, lights, visibilities=visibilities).image
+        return render(gbuffer, camera, lights, visibilities=visibilities)
 
 
 class Tiled(eqx.Module):
@@ -81,11 +78,9 @@ class Merged(eqx.Module):
     def __call__(self, gbuffer: Any, camera: Any, lights: Any, visibilities: Any = None) -> Any:
         """As the effect."""
         merged = [_merged([lights[index] for index in group]) for group in self.groups]
-        if not self.shadowed:
-            return render(gbuffer, camera, merged)
         first = [group[0] for group in self.groups]
         visible = [visibilities[n] if n in self.shadowed else None for n in first]
-        return start(gbuffer, camera, merged, visibilities=visible).image
+        return render(gbuffer, camera, merged, visibilities=visible)
 
 
 def relight(
@@ -117,13 +112,13 @@ def relight(
     - `gbuffer`, `camera`: as in `relight.render`, height width.
     - `lights`: a sequence of lights of any kinds.
     - `max_error`: root mean square, linear image units, over all pixels and channels.
-    - `visibilities`: as in `relight.start`: for each light height width in [0, 1], or None if
+    - `visibilities`: as in `relight.render`: for each light height width in [0, 1], or None if
       it has no shadows. None alone stands for no shadows at all.
 
     **Returns:** a `Plan`, to be called with `gbuffer, camera, lights` and, where there are
     shadows, `visibilities`: as many as there are here, None for those that are left out.
 
-    **Raises:** `ValueError` as `relight.start`, for a negative `max_error` or traced data.
+    **Raises:** `ValueError` as `relight.render`, for a negative `max_error` or traced data.
 
     **Gradient:** none through the choice. The plan's picture has that of `relight.render` in
     the lights that are kept or merged; in the others it is zero.

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._checks import Number, WholeNumber
+from jaxfx._checks import Number, WholeNumber, parameter
 from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
 from jaxfx.shadow import _taps
@@ -27,11 +27,13 @@ _SOME = 4096
 class Filter(eqx.Module):
     """`shadow.pcf`, everywhere or where the mask by depth has it, to the same end.
 
-    Of size 1 it is `shadow.hard`, and needs no mask.
+    Of size 1 it is `shadow.hard`, and needs no mask. A bias that is left out is what the full
+    filter needs, whatever the size, so that smaller filters differ from it by nothing else.
     """
 
-    bias: Float[Array, ""]
-    slope_bias: Float[Array, ""]
+    bias: Float[Array, ""] | None
+    slope_bias: Float[Array, ""] | None
+    full_size: int = eqx.field(static=True)
     size: int = eqx.field(static=True)
     masked: bool = eqx.field(static=True)
 
@@ -44,17 +46,19 @@ class Filter(eqx.Module):
 
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
         """As the effect."""
-        how = {"size": self.size, "bias": self.bias, "slope_bias": self.slope_bias}
+        data = (shadow_map, receivers, self.bias, self.slope_bias)
+        *data, bias, slope_bias, _ = _taps.checked("shadow", *data, size=self.full_size)
+        how = {"size": self.size, "bias": bias, "slope_bias": slope_bias}
         if self.masked and self.size > 1:
-            return edge_pcf(shadow_map, receivers, mask="depth", **how)
-        return pcf(shadow_map, receivers, **how)
+            return edge_pcf(*data, mask="depth", **how)
+        return pcf(*data, **how)
 
 
 class Picked(eqx.Module):
-    """`shadow.pcf` in some pixels, row by row, `shadow.hard` in the others."""
+    """`shadow.pcf` in some pixels, row by row, the comparison alone in the others."""
 
-    bias: Float[Array, ""]
-    slope_bias: Float[Array, ""]
+    bias: Float[Array, ""] | None
+    slope_bias: Float[Array, ""] | None
     size: int = eqx.field(static=True)
     pixels: Int[Array, " pixel"]
     title: ClassVar[str] = "shadow filtered in some pixels"
@@ -97,8 +101,8 @@ def shadow(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     max_error: Number,
 ) -> Plan:
     """The quickest shadow within an error of `shadow.pcf` with a filter of `size`.
@@ -127,14 +131,14 @@ def shadow(
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    given = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)
-    shadow_map, receivers = given[:2]
-    biases, size = (given[2], given[3]), int(size)
+    shadow_map = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)[0]
+    given = lambda name, each: None if each is None else parameter(f"shadow({name}=...)", each)
+    biases, size = (given("bias", bias), given("slope_bias", slope_bias)), int(size)
     where = candidates(
-        shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1], mask="depth"
+        shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1]
     ).where
     share = float(jnp.mean(where))
-    by = lambda size, masked=True: Filter(*biases, size, masked)
+    by = lambda less, masked=True: Filter(*biases, size, less, masked)
     data, text = (shadow_map, receivers), "the filter"
     if share**0.5 <= max_error:
         why = f"it can't matter in more than {share:.2%} of the pixels."

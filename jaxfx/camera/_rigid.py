@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -100,6 +101,27 @@ def read_map(depth: Any) -> tuple[Array, Array, Any]:
     working = working_dtype(depth.dtype)
     height, width = depth.shape
     return pixel_centers(height, width, working), depth.astype(working), depth.dtype
+
+
+def at_origin(camera: Any) -> Any:
+    """A camera of either kind, turned as it is, at the world's origin.
+
+    For what does not depend on where it stands: a difference of two points far away from the
+    origin would have few digits left.
+    """
+    pose = camera.world_from_camera.at[:3, 3].set(0)
+    return eqx.tree_at(lambda camera: camera.world_from_camera, camera, pose)
+
+
+def per_depth(camera: Any, pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
+    """How far rays through pixels lead in the world, for each unit of depth.
+
+    Of no two points of a ray: those of a scene of 1e6 differ by a unit of depth in few digits.
+    """
+    turn, pixels = camera.world_from_camera[:3, :3], homogeneous(pixels)
+    if hasattr(camera, "intrinsics"):
+        return transformed(turn, transformed(jnp.linalg.inv(camera.intrinsics), pixels))
+    return each(turn[:, 2], pixels)
 
 
 def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
 
 from jaxfx._arguments import check_camera, check_lens
 from jaxfx._checks import WholeNumber, check_image, parameter, whole_number
 from jaxfx._numerics import safe_sqrt, working_dtype
+from jaxfx._progress import counted
 from jaxfx.camera import PinholeCamera
 from jaxfx.lens import ThinLens
 
@@ -21,7 +21,8 @@ class Accumulation(NamedTuple):
 
     - `image`: height width channel, the mean of all passes, linear radiance.
     - `convergence`: the root-mean-square difference between the mean of the first half of the
-      passes and the mean of all, in units of radiance; NaN for a single pass.
+      passes and the mean of all, over the pixels that are finite, in units of radiance; NaN for
+      a single pass.
     """
 
     image: Float[Array, "height width channel"]
@@ -36,7 +37,7 @@ def accumulate(
     samples: WholeNumber = 256,
     jitter: bool = True,
     seed: WholeNumber = 0,
-    progress: bool = True,
+    progress: bool = False,
 ) -> Accumulation:
     """Depth of field by many passes: the mean of pictures from points all over the lens.
 
@@ -54,7 +55,7 @@ def accumulate(
     - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
       pixel.
     - `seed`: static; an integer from 0, turns the sequence to another of its kind.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** an `Accumulation`: `image`, height width channel, in the renderer's float type
     (JAX's default for integers), summed in float32 at least; and `convergence`.
@@ -77,7 +78,7 @@ def accumulate(
 
     offsets, shifts = lens_samples(samples, seed)
     total = half = dtype = None
-    for index in tqdm(range(samples), desc="lens", disable=not progress, leave=False):
+    for index in counted(range(samples), progress, "lens"):
         offset = lens.aperture * jnp.asarray(offsets[index], lens.aperture.dtype)
         eye = camera.through_lens(offset, focus_distance=lens.focus_distance)
         if jitter:
@@ -98,7 +99,14 @@ def accumulate(
     mean = total / samples
     if half is None:
         return Accumulation(mean.astype(dtype), jnp.asarray(jnp.nan, mean.dtype))
-    return Accumulation(mean.astype(dtype), safe_sqrt(jnp.mean((half - mean) ** 2)))
+    return Accumulation(mean.astype(dtype), _root_mean_square(half - mean))
+
+
+def _root_mean_square(difference: Float[Array, "..."]) -> Float[Array, ""]:
+    """Of the numbers that are finite; NaN where none is."""
+    finite = jnp.isfinite(difference)
+    squares = jnp.where(finite, difference, 0) ** 2
+    return safe_sqrt(jnp.sum(squares) / jnp.sum(finite, dtype=squares.dtype))
 
 
 def lens_samples(

@@ -11,15 +11,12 @@ from jaxtyping import Array, Float, Num
 from jaxfx._checks import Number, WholeNumber, whole_number
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._inputs import check_arguments, defocused, with_own
-from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, coverage, reach, row_half_width
-from jaxfx.dof._tiles import tiles
+from jaxfx.dof._spoiled import spoiled
+from jaxfx.dof._sprites import POINT_RADIUS, coverage, reach, row_half_width
+from jaxfx.dof._tiles import sum_all
 from jaxfx.lens import Lens
 
 
-# Where "shift" adds fewer taps than this, it compiles sooner than "tiles", by half a second: as
-# much as forty calls take longer.
-_FEW_TAPS = 2**20
 # Coverage below this is none.
 _LEAST = 1e-12
 
@@ -64,9 +61,9 @@ def depth_sorted(
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a bad `slices`, or no
     `max_coc` under a transform.
 
-    **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; zero where a
-    circle is clamped. With `slices="all"` that of the order itself is missing: where two
-    surfaces change places, the result jumps.
+    **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; in the last
+    two, zero where a circle is below a pixel or above `max_coc`. With `slices="all"` that of
+    the order itself is missing: where two surfaces change places, the result jumps.
 
     Source: Potmesil & Chakravarty 1981, partial visibility of a sprite; Demers 2004, blending
     in order of depth. Reconstructed: the order is kept front to back, since "over" of single
@@ -97,22 +94,8 @@ def _depth_sorted(image, depth, lens, max_coc, slices):
     sums = with_own(sums, image, missing)
     result = sums[..., :-1] / sums[..., -1:]
 
-    def spoiled():
-        reached = jnp.where(jnp.isnan(lens.defocus(depth)), max_coc / 2, radius)
-        return _sum_all(bad[..., None].astype(image.dtype), reached, far)[..., 0] > 0
-
-    spoils = jax.lax.cond(bad.any(), spoiled, lambda: bad)
-    return jnp.where((spoils | lost)[..., None], jnp.nan, result).astype(dtype)
-
-
-def _sum_all(
-    value: Float[Array, "height width value"], radius: Float[Array, "height width"], far: int
-) -> Float[Array, "height width value"]:
-    """The sums over all sprites, whatever hides them."""
-    zero, one = jnp.zeros_like(radius), jnp.ones((), radius.dtype)
-    sprites = Sprites(value, radius, zero - 1, zero, one)
-    is_small = radius.size * (2 * far + 1) ** 2 < _FEW_TAPS
-    return (shift if is_small else tiles)(sprites, far)
+    spoils = spoiled(bad, jnp.abs(defocus), max_coc) | lost
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(dtype)
 
 
 def _in_slices(
@@ -131,7 +114,7 @@ def _in_slices(
         within = share > 0
         # A sprite of another slice is a point, so that it reaches no further than itself.
         part = jnp.where(within, share, 0)[..., None] * value
-        added = _sum_all(part, jnp.where(within, radius, POINT_RADIUS), far)
+        added = sum_all(part, jnp.where(within, radius, POINT_RADIUS), far)
         opacity = added[..., -1:]
         visible = clip01((1 - covered) / jnp.maximum(opacity, _LEAST))
         return (sums + visible * added, covered + opacity), None

@@ -12,9 +12,9 @@ from jaxfx._checks import Number, check, check_depth, check_image, items, parame
 from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof._inputs import check_arguments, compiled, defocused, with_own
 from jaxfx.dof._sheets import composited
-from jaxfx.dof._shift import shift
 from jaxfx.dof._slices import SLICES, Sheets
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
+from jaxfx.dof._spoiled import spoiled
+from jaxfx.dof._sprites import POINT_RADIUS, reach
 from jaxfx.lens import Lens
 
 
@@ -82,9 +82,11 @@ def layered(
     `threshold`, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
-    every field of `lens`, forward and reverse; zero where a sprite is clamped. There is no kink
-    where neighbours have one depth or a surface is in focus. At the others, the ends of a
-    clamp and a lens that is just filled, each sprite and pixel has the value of one side.
+    every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
+    where a circle of confusion is below a pixel or above `max_coc`: no search leaves a lens all
+    of whose circles are. There is no kink where neighbours have one depth or a surface is in
+    focus. At the others, the ends of a clamp and a lens that is just filled, each sprite and
+    pixel has the value of one side.
 
     Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
     pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.
@@ -120,7 +122,7 @@ def _layered(image, depth, lens, max_coc, behind, threshold):
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
     through = jnp.where(view.missing, 0, jnp.ones_like(view.defocus))
     layers = [_sheet(view.image, view.defocus, through, view.missing, threshold)]
-    spoiled = _spoiled(view.bad, depth, view.defocus, max_coc)
+    spoils = spoiled(view.bad, jnp.abs(view.defocus), max_coc) | view.lost
     if behind is not None:
         second = defocused(behind[0], behind[1], behind[2], max_coc)
         # Behind what is not known it is not known what is seen.
@@ -132,7 +134,7 @@ def _layered(image, depth, lens, max_coc, behind, threshold):
         apart = clip01((farther - view.defocus) / threshold - 1)
         through = jnp.where(there, clip01(seen / _SEEN) * apart, 0)
         layers.append(_sheet(second.image, farther, through, view.missing, threshold))
-        spoiled |= _spoiled(second.bad, behind[1], second.defocus, max_coc)
+        spoils |= spoiled(second.bad, jnp.abs(second.defocus), max_coc)
     far = reach(max_coc)
     # Beyond the frame all goes on as it ends there.
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
@@ -140,8 +142,7 @@ def _layered(image, depth, lens, max_coc, behind, threshold):
     light, late = jnp.split(jnp.moveaxis(composited(far, sheets), 0, -1), 2, axis=-1)
     late = with_own(late, view.image, view.missing)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
-    spoiled |= view.lost
-    return jnp.where(spoiled[..., None], jnp.nan, result).astype(image.dtype)
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)
 
 
 def _sheet(
@@ -235,21 +236,3 @@ def _seen(
         return 1 - clip01(hidden) ** 2
 
     return jnp.mean(jax.lax.map(visible, jnp.asarray(ways)), axis=0)
-
-
-def _spoiled(
-    bad: Bool[Array, "height width"],
-    depth: Float[Array, "height width"],
-    defocus: Float[Array, "height width"],
-    max_coc: float,
-) -> Bool[Array, "height width"]:
-    """Where the sprites of the `bad` pixels reach; nothing is computed if there are none."""
-    radius = jnp.where(depth > 0, jnp.maximum(jnp.abs(defocus) / 2, POINT_RADIUS), max_coc / 2)
-    radius = jax.lax.stop_gradient(radius)
-
-    def cover():
-        zero, one = jnp.zeros_like(radius), jnp.ones((), radius.dtype)
-        value = bad[..., None].astype(radius.dtype)
-        return shift(Sprites(value, radius, zero - 1, zero, one), reach(max_coc))[..., 0] > 0
-
-    return jax.lax.cond(bad.any(), cover, lambda: bad)

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfx._checks import Number, check, option, parameter
 from jaxfx.dof._inputs import check_arguments, largest_of, pixels, with_own
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
-from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
+from jaxfx.dof._spoiled import spoiled
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.dof._tiles import farthest, shifts, tiles
 from jaxfx.lens import Lens
@@ -85,9 +85,10 @@ def scatter(
 
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
     `lens`, silhouettes included, forward and reverse; again by `jax.jacfwd(jax.grad(loss))`,
-    which `jax.hessian` is. Zero where a sprite is clamped. At a kink (the focus plane, the ends
-    of both clamps) one of the two one-sided values. With `coverage="indicator"` the derivative
-    of the coverage, almost everywhere zero, is missing.
+    which `jax.hessian` is. In `lens` and `depth`, zero where a circle of confusion is below a
+    pixel or above `max_coc`: no search leaves a lens all of whose circles are. At a kink (the
+    focus plane, the ends of both clamps) one of the two one-sided values. With
+    `coverage="indicator"` that of the coverage, almost everywhere zero, is missing.
 
     Source: Lee, Kim & Choi, real-time depth of field rendering using pixel intensity scatter on
     GPU, sections 3 and 4; the model is that of Potmesil & Chakravarty 1981. Our own: the exact
@@ -118,11 +119,6 @@ def scatter(
     return _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage)
 
 
-def _radius(coc: Float[Array, "height width"], max_coc: int | float) -> Array:
-    coc = jnp.where(coc < max_coc, coc, max_coc)
-    return jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
-
-
 def to_sprites(
     image: Float[Array, "height width channel"],
     depth: Float[Array, "height width"],
@@ -136,7 +132,7 @@ def to_sprites(
     dtype = image.dtype
     coc = lens.circle_of_confusion(depth)
     coc = jnp.where(coc < max_coc, coc, max_coc)
-    radius = _radius(coc, max_coc)
+    radius = jnp.where(coc / 2 < POINT_RADIUS, POINT_RADIUS, coc / 2)
 
     focus = lens.focus_distance.astype(dtype)
     foreground = depth < focus
@@ -153,27 +149,6 @@ def to_sprites(
     leak = jnp.where(foreground, -1, coc)
     # What leaks onto a pixel of unknown depth is not known: all of it is taken.
     return Sprites(value, radius, leak, jnp.where(missing, max_coc, coc), epsilon)
-
-
-def _spoiled(
-    wrong: Bool[Array, "height width"],
-    radius: Float[Array, "height width"],
-    max_coc: int | float,
-) -> Bool[Array, "height width"]:
-    """Where the sprites of the `wrong` pixels reach; nothing is computed if there are none."""
-
-    def cover(wrong, radius):
-        value = wrong[..., None].astype(radius.dtype)
-        zero = jnp.zeros_like(radius)
-        one = jnp.ones((), radius.dtype)
-        return shift(Sprites(value, radius, zero - 1, zero, one), reach(max_coc))[..., 0] > 0
-
-    # One by one, since under `vmap` a `cond` of its own would compute both.
-    @sequential_vmap
-    def spoiled(wrong, radius):
-        return jax.lax.cond(wrong.any(), cover, lambda wrong, _: wrong, wrong, radius)
-
-    return spoiled(wrong, radius)
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8))
@@ -249,6 +224,5 @@ def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
     seen = pixels(image, depth, lens)
     operands = seen.image, seen.depth, lens, gamma, epsilon, seen.missing
     result = _in_or_out_of_focus(*operands, max_coc, kernel, coverage)
-    coc = jax.lax.stop_gradient(lens.circle_of_confusion(seen.depth))
-    spoiled = _spoiled(seen.bad, _radius(coc, max_coc), max_coc) | seen.lost
-    return jnp.where(spoiled[..., None], jnp.nan, result).astype(image.dtype)
+    spoils = spoiled(seen.bad, lens.circle_of_confusion(seen.depth), max_coc) | seen.lost
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)

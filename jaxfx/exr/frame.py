@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxfx._files import StrPath, check_suffix
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.exr.layers import MAX_PIXELS, StrPath, assemble, read_planes, write_planes
+from jaxfx.exr._parts import MAX_PIXELS
+from jaxfx.exr.layers import assemble, read_planes, write_planes
 from jaxfx.gbuffer import GBuffer
 
 
@@ -30,6 +32,7 @@ def write_gbuffer(path: StrPath, gbuffer: GBuffer, *, camera: Camera | None = No
 
     **Gradient:** none; the host side.
     """
+    check_suffix("write_gbuffer(path)", path, ".exr")
     attributes: dict[str, Any] = {}
     if camera is not None:
         attributes = {

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
+
+from jaxfx._progress import Bar
 
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -20,12 +21,37 @@ Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 _PATIENCE, _GAIN = 6, 1e-5
 
 
+_Item: Any = type(optx.RESULTS.successful)
+
+
+class Verdict(_Item):
+    """One of `optimistix.RESULTS`, equal to it, that prints as a sentence, a success too."""
+
+    def __repr__(self) -> str:
+        return optx.RESULTS[self] or "The search converged."
+
+
+def verdict(result: optx.RESULTS) -> Any:
+    """A `Verdict` of optimistix' own."""
+    (index,) = jax.tree.leaves(result)
+    return Verdict(index, optx.RESULTS)
+
+
 class End(NamedTuple):
     """Where a solver stopped, the losses at its start and after every step, its verdict."""
 
     unknowns: Any
     losses: list[Float[Array, ""]]
     result: optx.RESULTS
+
+    def check(self, function: str, sought: str) -> None:
+        """Raise `RuntimeError` where the solver failed."""
+        if self.result != optx.RESULTS.successful:
+            raise RuntimeError(
+                f"`{function}` found no {sought} in {len(self.losses)} steps, the mean squared "
+                f"residual going from {self.losses[0]:.3g} to {self.losses[-1]:.3g}: "
+                f"{self.result} `throw=False` returns what was reached."
+            )
 
 
 def descend(
@@ -34,7 +60,7 @@ def descend(
     *,
     solver: Solver | None,
     max_steps: int,
-    bar: tqdm,
+    bar: Bar,
 ) -> End:
     """From a start to the end that a solver finds, Levenberg-Marquardt if none is given.
 
@@ -47,24 +73,23 @@ def descend(
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     y, state = unknowns, _begin(solver, fn, unknowns)
     losses, lowest, best, waited = [], math.inf, y, 0
-    verdict = optx.RESULTS.nonlinear_max_steps_reached
+    reason = optx.RESULTS.nonlinear_max_steps_reached
     for _ in range(max_steps):
         given = y
         y, state, loss, done, result = _step(solver, fn, y, state)
         losses.append(loss)
-        bar.update()
-        bar.set_postfix(mse=f"{float(loss):.3g}")
+        bar.step(mse=f"{float(loss):.3g}")
         waited = waited + 1 if loss > (1 - _GAIN) * lowest else 0
         if loss < lowest:
             lowest, best = float(loss), given
         if done or waited >= patience or result != optx.RESULTS.successful:
-            verdict = result
+            reason = result
             break
-    y = _finish(solver, fn, y, state, losses[-1], verdict)
+    y = _finish(solver, fn, y, state, losses[-1], reason)
     loss = _loss(fn, y)
     if not math.isfinite(loss):
-        y, loss, verdict = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
-    return End(y, [*losses, loss], verdict)
+        y, loss, reason = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
+    return End(y, [*losses, loss], verdict(reason))
 
 
 class _Objective(eqx.Module):

@@ -166,7 +166,7 @@ def best_colors(
 
 def spread(gbuffer: GBuffer, camera: _Camera) -> Float[Array, ""]:
     """How far the visible points are from their mean, root mean square; 1 for a single one."""
-    shown = jnp.isfinite(gbuffer.depth)
+    shown = (gbuffer.depth > 0) & jnp.isfinite(gbuffer.depth)
     height, width = shown.shape
     pixels = pixel_centers(height, width, gbuffer.depth.dtype)
     points = np.asarray(camera.unproject(pixels, jnp.where(shown, gbuffer.depth, 1)))[shown]

@@ -12,11 +12,11 @@ import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
-from tqdm.auto import tqdm
 
 from jaxfx._arguments import check_camera
 from jaxfx._checks import Number, WholeNumber, check, check_image, whole_number
 from jaxfx._numerics import safe_divide
+from jaxfx._progress import Bar
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
@@ -39,7 +39,8 @@ class CameraFit(eqx.Module):
       its own axes: three of translation in scene units, three of rotation in radians. As if
       the residuals were independent: they are not, so compare the numbers with one another.
     - `share`: the share of the reference's pixels, a ratio, that had a say in the end.
-    - `result`: optimistix' verdict on the sharpest pictures.
+    - `result`: optimistix' verdict on the sharpest pictures, and divergence where nothing of
+      the source is seen in the end.
     """
 
     camera: PinholeCamera
@@ -65,7 +66,7 @@ def camera(
     solver: Solver | None = None,
     max_steps: WholeNumber = 32,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> CameraFit:
     """The pose from which a photograph was taken, given another one with its depth.
 
@@ -90,17 +91,20 @@ def camera(
 
     - `reference`: rows columns channel, linear radiance: the photograph whose pose is asked.
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the axis of `source`; inf, NaN and 0 as in
-      `reproject.warp`.
+    - `depth`: height width, scene units along the axis of `source`; inf, and what is missing
+      (0, negative, NaN), as in `reproject.warp`.
     - `source`: the camera of `image` and `depth`.
     - `start`: the reference's camera with its true intrinsics and a pose to start from: some
-      3 degrees and 3 % of the scene's depth away.
+      3 degrees and 3 % of the scene's depth away. Of four pairs of photographs of a room with
+      their depth, 160 x 120 pixels, two that lie 1.5 and 3.8 degrees apart (5 and 9 cm) were
+      found from the source's own pose to 0.04 degrees and 2 mm; two that lie 7.7 degrees apart
+      (14 and 26 cm) to 0.06 degrees and 2 mm, and to 0.4 degrees and 13 mm.
     - `hole_threshold`: as in `reproject.warp`, a ratio of depths.
     - `solver`: any least-squares solver or minimiser of optimistix; by default
       Levenberg-Marquardt.
     - `max_steps`: of the solver, for each blur.
     - `throw`: raise where the solver fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `CameraFit`.
 
@@ -116,23 +120,25 @@ def camera(
     reference, image, depth = _pictures(reference, image, depth)
     max_steps = _check(source, start, max_steps)
     check_options("camera", reference.shape[:2], "pyramid", hole_threshold)
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         model, end = _search(
             reference, image, depth, source, start, float(hole_threshold), descend_on
         )
     columns, residual, share = _report(model, end.unknowns)
-    if throw and (end.result != optx.RESULTS.successful or share == 0):
+    # Where nothing is seen the residual is 0, which a solver takes for success.
+    result = end.result if share > 0 else optx.RESULTS.nonlinear_divergence
+    if throw and result != optx.RESULTS.successful:
         raise RuntimeError(
             f"`camera` found no pose in {len(end.losses)} steps, the mean squared residual "
             f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g} over "
-            f"{100 * float(share):.0f} % of the pixels: {optx.RESULTS[end.result]} "
+            f"{100 * float(share):.0f} % of the pixels: {optx.RESULTS[result]} "
             "`throw=False` returns what was reached."
         )
     errors = standard_errors(columns, residual) / jnp.sqrt(share)
     errors = jnp.where(share > 0, errors, jnp.inf) * model.unit
     eye, losses = model.eye(end.unknowns), jnp.stack(end.losses)
-    return CameraFit(eye, losses, errors, share, end.result)
+    return CameraFit(eye, losses, errors, share, result)
 
 
 def _search(

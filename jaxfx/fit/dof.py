@@ -13,7 +13,6 @@ import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, Num
-from tqdm.auto import tqdm
 
 from jaxfx._arguments import check_lens
 from jaxfx._checks import (
@@ -27,7 +26,9 @@ from jaxfx._checks import (
     parameter,
     whole_number,
 )
+from jaxfx._progress import Bar
 from jaxfx.dof._inputs import largest_coc
+from jaxfx.dof._sprites import POINT_RADIUS
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
 from jaxfx.fit._descent import End, Solver, descend, standard_errors
@@ -63,7 +64,7 @@ class DofFit(eqx.Module):
       minima.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
       larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
-    - `result`: optimistix' verdict.
+    - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
     """
 
     lens: ThinLens
@@ -99,7 +100,7 @@ def dof(
     parameters: Collection[str] | None = None,
     max_steps: WholeNumber = 64,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> DofFit:
     """The lens and the other parameters that make a method look most like a reference.
 
@@ -125,13 +126,14 @@ def dof(
       `fit.LAYERED_PARAMETERS`; the others stay as given. By default all of them.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the solver fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `DofFit`.
 
     **Raises:** `ValueError` for what the method refuses, for shapes that differ, an unknown
-    or empty choice of parameters, a zero aperture to start from, or a picture that is not
-    finite. `RuntimeError` where the solver fails and `throw` is true.
+    or empty choice of parameters, a lens to start from that can't move (a zero aperture; all
+    circles of confusion below a pixel or above `max_coc`), or a picture that is not finite.
+    `RuntimeError` where the solver fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
     """
@@ -142,19 +144,15 @@ def dof(
     max_steps = whole_number("dof(max_steps=...)", max_steps)
     if max_coc is not None:
         max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
+    _check_moves(unknowns, lens, depth, behind, max_coc)
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         solve = lambda model, y: descend(
             _Residual(model, reference), y, solver=solver, max_steps=max_steps, bar=bar
         )
         model, end = _search(model, unknowns, solve)
-    if throw and end.result != optx.RESULTS.successful:
-        raise RuntimeError(
-            f"`dof` found no fit in {len(end.losses)} steps, the mean squared residual going "
-            f"from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {optx.RESULTS[end.result]} "
-            "`throw=False` returns what was reached."
-        )
-
+    if throw:
+        end.check("dof", "lens")
     found = _constrain(end.unknowns, image.dtype)
     values = start | found
     fitted = _drawn(model, found)
@@ -204,6 +202,27 @@ def _start(lens: Any, gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
     for name in ("gamma", "epsilon", "threshold"):
         check(f"dof({name}=...)", start[name], lambda v: v >= 0, "0 or positive")
     return {name: value.astype(dtype) for name, value in start.items()}
+
+
+def _check_moves(
+    names: Collection[str], lens: ThinLens, depth: Array, behind: Any, max_coc: Any
+) -> None:
+    """`ValueError` for a lens to be found of which no circle of confusion has a derivative."""
+    if not {"aperture", "focus_distance"}.intersection(names):
+        return
+    depths = (depth,) if behind is None else (depth, jnp.asarray(behind[1]))
+    circles = jnp.stack([lens.circle_of_confusion(each) for each in depths])
+    most = math.inf if max_coc is None else max_coc
+    # What is no diameter at all is named by the method.
+    if most <= 0 or bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
+        return
+    least, largest = (float(each(circles)) for each in (jnp.nanmin, jnp.nanmax))
+    raise ValueError(
+        "`dof(lens)` must start with a circle of confusion between a pixel and `max_coc` "
+        "somewhere, for no other has a derivative that could move the aperture or the focus "
+        f"distance, got circles from {least:.3g} to {largest:.3g} pixels and "
+        f"`max_coc` {max_coc}."
+    )
 
 
 def _names(method: Method, parameters: Collection[str] | None) -> list[str]:

@@ -1,5 +1,6 @@
 """The lights of a picture, from it and a deep frame buffer: inverse lighting."""
 
+import logging
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, final
 
@@ -10,12 +11,12 @@ import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_lights
 from jaxfx._checks import WholeNumber, check, check_image, items, share, whole_number
+from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.fit._descent import End, Solver, descend, standard_errors
+from jaxfx.fit._descent import End, Solver, descend, standard_errors, verdict
 from jaxfx.fit._lighting import (
     Model,
     Residual,
@@ -29,6 +30,8 @@ from jaxfx.fit._lighting import (
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import Light
 
+
+_logger = logging.getLogger("jaxfx")
 
 LIGHT_PARAMETERS = ("color", "position", "direction", "angles")
 
@@ -52,7 +55,8 @@ class LightsFit(eqx.Module):
     - `indistinct`: groups of lights, by their indices, that the picture can't tell apart: it
       stays the same, to a thousandth of what each change alone would do, when the parameters of
       all the group's lights change together. Colours within a group are the smallest.
-    - `result`: optimistix' verdict on the last round.
+    - `result`: optimistix' verdict on the last round, one of its `RESULTS`; it prints as a
+      sentence.
     """
 
     lights: tuple[Light, ...]
@@ -80,7 +84,7 @@ def lights(
     parameters: Collection[str] = LIGHT_PARAMETERS,
     max_steps: WholeNumber = 64,
     throw: bool = True,
-    progress: bool = True,
+    progress: bool = False,
 ) -> LightsFit:
     """The lights under which a deep frame buffer looks most like a reference.
 
@@ -90,13 +94,15 @@ def lights(
     0 < inner < outer < pi, by logistic functions. Colours are not forced to be positive: a
     negative one says that the model does not fit.
 
-    The search is local. Started too far away it may end in another minimum, and a light that
-    lights nothing to begin with stays where it is.
+    The search is local. Started too far away it may end in another minimum. What changes
+    nothing to begin with, the place of a light that lights nothing say, has no derivative to
+    move it: it stays, and the log says so.
 
     **Arguments:**
 
     - `reference`: height width 3, linear radiance.
-    - `gbuffer`, `camera`: as in `relight.shade`.
+    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing (0, negative, NaN)
+      a pixel has no say.
     - `lights`: their number and kinds, and where the search starts; colours count only if they
       are not fitted.
     - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
@@ -109,13 +115,13 @@ def lights(
     - `parameters`: the names to fit, out of `fit.LIGHT_PARAMETERS`; the others stay as given.
     - `max_steps`: of the solver, in each round.
     - `throw`: raise where the last round fails; else the failure stands in the result.
-    - `progress`: show a bar on stderr.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `LightsFit`.
 
     **Raises:** `ValueError` for what `relight.shade` refuses, for shapes or numbers of entries
-    that differ, for parameters that no light has, or a reference that is not finite.
-    `RuntimeError` where the last round fails and `throw` is true.
+    that differ, parameters that no light has, a reference that is not finite, or a start where
+    nothing changes the image. `RuntimeError` where the last round fails and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
 
@@ -124,12 +130,12 @@ def lights(
     """
     gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
     check_camera("lights(camera)", camera)
-    reference = _reference(reference, gbuffer)
+    reference, gbuffer = _known(_reference(reference, gbuffer), gbuffer)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
     rounds = whole_number("lights(rounds=...)", rounds)
     max_steps = whole_number("lights(max_steps=...)", max_steps)
-    with tqdm(desc="fit", unit="step", disable=not progress, leave=False) as bar:
+    with Bar(progress, "fit") as bar:
         model, end = _search_in_rounds(
             rounds,
             start,
@@ -137,14 +143,9 @@ def lights(
             visibility,
             lambda model, lights: _search(model, lights, reference, solver, max_steps, bar),
         )
+    if throw:
+        end.check("lights", "lights")
     found, losses = end.unknowns, end.losses
-    if throw and end.result != optx.RESULTS.successful:
-        raise RuntimeError(
-            f"`lights` found no fit in {len(losses)} steps, the mean squared residual going "
-            f"from {losses[0]:.3g} to {losses[-1]:.3g}: {optx.RESULTS[end.result]} "
-            "`throw=False` returns what was reached."
-        )
-
     image, columns = _linearized(model, found)
     errors = standard_errors(columns, image - reference)
     owners = [i for i, each in enumerate(map(model.values, found)) for _ in _flat(each)]
@@ -168,6 +169,14 @@ def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
         )
     check("lights(reference)", reference, np.isfinite, "finite")
     return reference.astype(gbuffer.color.dtype)
+
+
+def _known(reference: Array, gbuffer: GBuffer) -> tuple[Array, GBuffer]:
+    """Both black where the depth is missing: such a pixel has no say."""
+    missing = ~(gbuffer.depth > 0)
+    shader = jnp.where(missing, -1, gbuffer.shader)
+    gbuffer = eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
+    return jnp.where(missing[..., None], 0, reference), gbuffer
 
 
 def _start(lights: Any) -> tuple[Light, ...]:
@@ -230,9 +239,10 @@ def _search(
     reference: Float[Array, "height width 3"],
     solver: Solver | None,
     max_steps: int,
-    bar: tqdm,
+    bar: Bar,
 ) -> End:
     """One round: an `End` whose unknowns are the lights found."""
+    _say_what_does_not_move(model, lights)
     search = Search(model, lights, spread(model.gbuffer, model.camera))
     unit = jnp.sqrt(jnp.mean(reference**2))
     residual = Residual(search, reference, jnp.where(unit > 0, unit, 1))
@@ -240,7 +250,9 @@ def _search(
     if any(unknowns):
         end = descend(residual, unknowns, solver=solver, max_steps=max_steps, bar=bar)
     else:
-        end = End(unknowns, [jnp.mean(residual(unknowns) ** 2)], optx.RESULTS.successful)
+        end = End(
+            unknowns, [jnp.mean(residual(unknowns) ** 2)], verdict(optx.RESULTS.successful)
+        )
     found = _moved(search, end.unknowns)
     if "color" in model.names:
         best = jnp.asarray(best_colors(_basis(model, found), reference).T, float)
@@ -250,6 +262,30 @@ def _search(
         ]
     square = residual.unit.astype(float) ** 2
     return End(tuple(found), [loss * square for loss in end.losses], end.result)
+
+
+def _say_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None:
+    """Log what of the lights changes nothing in the image; `ValueError` if all of it does."""
+    values = [model.values(light) for light in lights]
+    # Colours that are fitted are found whatever they were.
+    white = lambda light, own: with_values(
+        light, {"color": jnp.ones(3)} if "color" in own else {}
+    )
+    columns = _linearized(model, tuple(map(white, lights, values)))[1]
+    is_moving = np.asarray(jnp.any(columns != 0, axis=0)).tolist()
+    moving, fixed = [], []
+    for index, own in enumerate(values):
+        for name, value in own.items():
+            numbers, is_moving = is_moving[: len(value)], is_moving[len(value) :]
+            (moving if any(numbers) else fixed).append(f"{name} of light {index}")
+    names = ", ".join(fixed)
+    if not moving:
+        raise ValueError(
+            "`lights(lights)` must start where something that is fitted changes the image, "
+            f"got no derivative in {names}."
+        )
+    if fixed:
+        _logger.warning("`lights` can't move %s, which changes nothing at the start.", names)
 
 
 @eqx.filter_jit

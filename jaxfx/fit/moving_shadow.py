@@ -39,7 +39,7 @@ class MovingShadow(eqx.Module):
     **Arguments:**
 
     - `shadow_map`: rows columns, depth from the light in scene units, inf where there is
-      nothing.
+      nothing; what is 0, negative or NaN is missing, and shadows nothing.
     - `light_camera`: what it was made with: orthographic for a directional light, a pinhole at
       the light's position for others.
     - `gbuffer`, `camera`: the picture's; `normal` and `depth` are read.
@@ -83,7 +83,7 @@ class MovingShadow(eqx.Module):
         check("MovingShadow(softness=...)", softness, lambda v: v > 0, "positive")
         self.occluders, self.known = _points(light_camera, shadow_map.astype(float))
         self.receivers, self.shown = _points(camera, gbuffer.depth.astype(float))
-        self.normals = gbuffer.normal.astype(float)
+        self.normals = jnp.where(self.shown[..., None], gbuffer.normal.astype(float), 0)
         self.light_camera, self.softness, self.size = light_camera, softness, size
 
     def __call__(self, light: _Moving) -> Float[Array, "height width"]:
@@ -144,7 +144,7 @@ def _points(
     camera: _Camera, depth: Float[Array, "rows columns"]
 ) -> tuple[Float[Array, "rows columns 3"], Bool[Array, "rows columns"]]:
     """What each pixel shows, and whether it shows anything; a harmless point if not."""
-    known = jnp.isfinite(depth)
+    known = (depth > 0) & jnp.isfinite(depth)
     pixels = pixel_centers(depth.shape[0], depth.shape[1], depth.dtype)
     return camera.unproject(pixels, jnp.where(known, depth, 1)), known
 

@@ -1,7 +1,7 @@
 """PNG files, and the sRGB curve that screens want."""
 
-import io
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from jaxfx._checks import as_numpy
-from jaxfx._files import StrPath, write_whole
-from jaxfx.io._pixels import png_values
+from jaxfx._extras import needs
+from jaxfx._files import StrPath, check_suffix, write_whole
+from jaxfx.io._pixels import log_profile, png_values
+
+
+# The gamma that files give to say sRGB.
+_SRGB_GAMMA = 1 / 2.2
 
 
 def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -73,13 +78,16 @@ def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) ->
       clipped to [0, 1] and rounded to the nearest of 256; NaN becomes 0. Alpha is stored
       linear.
 
-    **Raises:** `ValueError` for anything but an image of 1 to 4 channels; `OSError` where the
-    folder does not exist or can't be written.
+    **Raises:** `ValueError` for anything but an image of 1 to 4 channels, or a name that ends
+    in another suffix than `.png`; `OSError` where the folder does not exist or can't be
+    written.
 
     **Gradient:** none; the host side.
     """
-    from PIL import Image
+    with needs("io"):
+        from PIL import Image
 
+    check_suffix("write_png(path)", path, ".png")
     array = np.asarray(image)
     if array.ndim != 3 or not array.size or array.shape[2] > 4 or array.dtype.kind != "f":
         raise ValueError(
@@ -87,35 +95,53 @@ def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) ->
             f"got {array.dtype} of shape {array.shape}."
         )
     values = np.nan_to_num(array.astype(np.float64)).clip(0, 1)
-    pixels = np.rint(255 * _recolor(srgb_from_linear, values)).astype(np.uint8)
-    stream = io.BytesIO()
+    pixels = np.rint(255 * recolor(srgb_from_linear, values)).astype(np.uint8)
+    stream = BytesIO()
     Image.fromarray(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels).save(stream, "PNG")
     write_whole(path, stream.getbuffer())
 
 
 def read_png(path: StrPath) -> Float[np.ndarray, "height width channel"]:
-    """Read an sRGB picture into linear light.
+    """Read a PNG image of colours into linear light.
 
-    **Arguments:** `path`: a PNG file. Its numbers are taken for sRGB, alpha for linear; colour
-    profiles in the file are not heeded.
+    An image of depth is none of colours: `read_depth` gives its numbers as they are.
+
+    **Arguments:** `path`: a PNG file. Its numbers are taken for sRGB, or undone of the gamma
+    that the file names; alpha is linear. A colour profile in the file is not heeded, which is
+    logged where it is not sRGB.
 
     **Returns:** float32, height width channel, in [0, 1]: grey, grey and alpha, RGB or RGBA,
-    as in the file, 16 bits in full; a palette is looked up.
+    as in the file, 16 bits in full; a palette is looked up, and a colour that the file calls
+    transparent has alpha 0.
 
     **Raises:** `ValueError` that names the file where it is damaged or not PNG; `OSError` where
     it can't be opened.
 
     **Gradient:** none; the host side.
     """
-    data = Path(path).read_bytes()
+    return decode_png(path, Path(path).read_bytes())
+
+
+def decode_png(path: StrPath, data: bytes) -> np.ndarray:
+    """The image of a PNG file; `path` is for errors."""
+    with needs("io"):
+        from PIL import Image
+
     try:
         values = png_values(data)
+        facts = Image.open(BytesIO(data), formats=("PNG",)).info
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
-    return _recolor(linear_from_srgb, values).astype(np.float32)
+    log_profile(path, facts)
+    gamma = facts.get("gamma", _SRGB_GAMMA)
+    if "srgb" in facts or abs(gamma / _SRGB_GAMMA - 1) < 0.05:
+        return recolor(linear_from_srgb, values).astype(np.float32)
+    if not gamma > 0:
+        raise ValueError(f"`{path}` must have a gamma above 0, got {gamma}.")
+    return recolor(lambda codes: codes ** (1 / gamma), values).astype(np.float32)
 
 
-def _recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
+def recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
     """`curve` on the colours of an image, not on its alpha."""
     colors = 3 if values.shape[2] > 2 else 1
     return np.concatenate([curve(values[:, :, :colors]), values[:, :, colors:]], axis=2)

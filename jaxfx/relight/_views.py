@@ -72,12 +72,11 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     x, y = pixels[..., 0], pixels[..., 1]
     inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     flat = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
-    # Asked for once, not anew by each image that is read.
-    index = jax.lax.optimization_barrier(nearest(flat, jax.lax.stop_gradient(pixels)))
+    index = nearest(flat, jax.lax.stop_gradient(pixels))
     take = lambda field: read(field, index)
     shader, cached = take(gbuffer.shader), take(gbuffer.depth).astype(dtype)
     normal = take(gbuffer.normal).astype(dtype)
-    filled = inside & (shader >= 0) & jnp.isfinite(cached)
+    filled = inside & (shader >= 0) & (cached > 0) & jnp.isfinite(cached)
     cached = jnp.where(filled, cached, 1)
 
     centre = jnp.stack([index % width, index // width], axis=-1).astype(dtype) + 0.5
@@ -89,7 +88,8 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     seen &= _dot(normal, points.to_camera) > _AWAY
 
     to_camera = normalize(camera.unproject(centre, jnp.zeros_like(cached)) - points.position)
-    frontal = jnp.maximum(_dot(normal, to_camera), 0.01)
+    # A cache's normal may be no number where it does not see the point.
+    frontal = jnp.maximum(_dot(jnp.where(seen[..., None], normal, 0), to_camera), 0.01)
     detail = frontal * _pixels_per_area(camera, jnp.where(filled, depth, 1))
     return Found(seen, index, shader, normal, distance, detail)
 

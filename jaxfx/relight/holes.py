@@ -18,6 +18,8 @@ def fill_holes(
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """What `synthesize` left open, taken from the nearest pixel that a cache covers.
 
+    Pixels without a depth (inf, or missing: 0, negative, NaN) stay as they are.
+
     **Arguments:** `gbuffer`, `coverage`: height width, both from `synthesize`.
 
     **Returns:** the `GBuffer`, which keeps its depth; and the number of pixels filled, an

@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
-from jaxfx._checks import check, share
+from jaxfx._checks import check, share, shares
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -86,18 +86,24 @@ def shade(
 
 
 def render(
-    gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera, lights: Sequence[Light]
+    gbuffer: GBuffer,
+    camera: PinholeCamera | OrthographicCamera,
+    lights: Sequence[Light],
+    *,
+    visibilities: Sequence[Any] | None = None,
 ) -> Float[Array, "height width 3"]:
-    """The picture under several lights: the sum of `shade` over them, without shadows.
+    """The image under several lights and their shadows: the sum of `shade` over them.
 
     **Arguments:**
 
     - `gbuffer`, `camera`: as in `shade`.
-    - `lights`: a sequence of lights of any kinds. None give a black picture.
+    - `lights`: a sequence of lights of any kinds. None give a black image.
+    - `visibilities`: for each light, height width in [0, 1], or None where it has no shadows.
+      None alone stands for no shadows at all.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`.
 
-    **Raises:** `ValueError` as `shade` does.
+    **Raises:** `ValueError` as `shade` does, and for `visibilities` that do not fit.
 
     **Gradient:** as `shade`'s. A reverse pass shades each light again, so that its memory does
     not grow with their number.
@@ -105,7 +111,10 @@ def render(
     Source: as `shade`'s.
     """
     lights = check_lights("render(lights)", lights)
-    return _render(checked("render", gbuffer, camera), camera, lights)
+    gbuffer = checked("render", gbuffer, camera)
+    name, shape = "render(visibilities=...)", gbuffer.depth.shape
+    visible = tuple(shares(name, visibilities, len(lights), shape))
+    return _render(gbuffer, camera, lights, visible)
 
 
 class Surface(NamedTuple):
@@ -243,25 +252,46 @@ def check_shader(gbuffer: GBuffer) -> GBuffer:
     return gbuffer
 
 
+def stacked(
+    visibilities: Sequence[_Scalars | None], surface: Surface
+) -> Float[Array, "light height width"] | None:
+    """Those of some lights, all 1 where one has no shadows; None where none has any."""
+    if all(visible is None for visible in visibilities):
+        return None
+    dtype, lit = surface.position.dtype, jnp.ones_like(surface.exponent)
+    return jnp.stack([lit if each is None else each.astype(dtype) for each in visibilities])
+
+
+def seen(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> _Vectors:
+    """What a light brings, where it is visible; a hole's visibility is not read."""
+    if visibility is None:
+        return image
+    visibility = jnp.where(surface.shader == _NOTHING, 0, visibility.astype(image.dtype))
+    return visibility[..., None] * image
+
+
 @jax.jit
 def _shade(gbuffer, camera, light, visibility):
     surface = to_surface(gbuffer, camera)
-    image = reflected(surface, light)
-    if visibility is not None:
-        visibility = jnp.where(surface.shader == _NOTHING, 0, visibility.astype(image.dtype))
-        image = image * visibility[..., None]
+    image = seen(surface, reflected(surface, light), visibility)
     return image.astype(gbuffer.color.dtype)
 
 
 @jax.jit
-def _render(gbuffer, camera, lights):
+def _render(gbuffer, camera, lights, visibilities):
     surface = to_surface(gbuffer, camera)
     image = jnp.zeros_like(surface.position)
     again = jax.checkpoint(reflected, prevent_cse=False)
-    add = lambda image, light: (image + again(surface, light), None)
     stack = lambda *leaves: jnp.stack([leaf.astype(image.dtype) for leaf in leaves])
+
+    def add(image, term):
+        light, visibility = term
+        return image + seen(surface, again(surface, light), visibility), None
+
     for kind in get_args(Light):
-        group = [light for light in lights if isinstance(light, kind)]
-        if group:
-            image, _ = jax.lax.scan(add, image, jax.tree.map(stack, *group))
+        which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
+        if which:
+            group = jax.tree.map(stack, *(lights[i] for i in which))
+            shadows = stacked([visibilities[i] for i in which], surface)
+            image, _ = jax.lax.scan(add, image, (group, shadows))
     return image.astype(gbuffer.color.dtype)

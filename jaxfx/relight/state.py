@@ -6,7 +6,7 @@ new; a change of reflectance touches no light at all.
 """
 
 from collections.abc import Sequence
-from typing import Any, final
+from typing import Any, Literal, final
 
 import equinox as eqx
 import jax
@@ -21,7 +21,12 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight._sums import Sums, changed, image as shaded, nothing
-from jaxfx.relight.shading import Surface, checked, exponent, to_surface
+from jaxfx.relight.shading import (
+    Surface,
+    checked,
+    exponent,
+    to_surface,
+)
 
 
 _Image = Float[Array, "height width 3"]
@@ -111,17 +116,21 @@ class RelightState(eqx.Module):
         light: Light,
         visibility: Float[ArrayLike, "height width"]
         | Bool[ArrayLike, "height width"]
-        | None = None,
+        | Literal["kept"]
+        | None = "kept",
     ) -> "RelightState":
         """The state with another light in place of light `i`.
 
-        It costs the shading of the old light and of the new one, however many there are.
+        It costs the shading of the old light and of the new one, however many there are, and
+        the upkeep of sums that do not drift. That pays from some ten lights on. Of fewer,
+        `render` is quicker: 8 lights took 5 ms anew and 7 ms by an edit.
 
         **Arguments:**
 
         - `i`: static; the light's index, from 0.
         - `light`: the new light, of any kind.
-        - `visibility`: height width, in [0, 1], of the new light; all 1 if left out.
+        - `visibility`: height width, in [0, 1], of the new light; None for no shadows. Left
+          out, it is that of the old light, shadows and all.
 
         **Returns:** the new `RelightState`.
 
@@ -131,6 +140,12 @@ class RelightState(eqx.Module):
         the state, exact: what the old light brought is taken out of the derivatives too.
         """
         i = _index(self, "edit", i)
+        if isinstance(visibility, str):
+            if visibility != "kept":
+                raise ValueError(
+                    f'`edit(visibility)` must be an image, None or "kept", got {visibility!r}.'
+                )
+            visibility = self.visibilities[i]
         (light,), (visibility,) = _check(self, "edit", [light], [visibility])
         lights, visible = list(self.lights), list(self.visibilities)
         lights[i], visible[i] = light, visibility
@@ -146,7 +161,10 @@ class RelightState(eqx.Module):
     ) -> "RelightState":
         """The state with one light more, the last.
 
-        **Arguments:** as in `edit`.
+        **Arguments:**
+
+        - `light`: of any kind.
+        - `visibility`: height width, in [0, 1]; None for no shadows.
 
         **Returns:** the new `RelightState`.
 

@@ -71,7 +71,7 @@ def synthesize(
       camera, by the pixels that it spends on a unit of the surface.
 
     **Returns:** the `GBuffer`, its normals averaged on the sphere, its depth the one given; and
-    the coverage, height width, integers. A pixel of finite depth with coverage 0 is a hole: see
+    the coverage, height width, integers. A pixel of known depth with coverage 0 is a hole: see
     `fill_holes`. Holes and background have shader -1 and zeros. A NaN in a cache reaches only
     the pixels that read it.
 
@@ -211,8 +211,8 @@ def _synthesize(gbuffers, cameras, target, depth, *, tolerance, angle, weights):
         out = jnp.zeros_like(values[0])
         for value, part in zip(values, shares, strict=True):
             share = part.reshape(part.shape + (1,) * (out.ndim - 2))
-            # What has no share may not be finite.
-            out = out + jnp.where(share > 0, share * value, 0)
+            # What has no share may not be finite, nor be multiplied by a derivative's 0.
+            out = out + share * jnp.where(share > 0, value, 0)
         return out
 
     def read(name):

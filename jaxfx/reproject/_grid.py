@@ -7,12 +7,18 @@ A crossing is therefore a time and whether it lies just `after` that time.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
-class Rays(NamedTuple):
-    """Origins, directions and their reciprocals by coordinate; no border's time is NaN."""
+class Rays(eqx.Module):
+    """Origins, directions and their reciprocals by coordinate; no border's time is NaN.
+
+    They begin at time 0. With `from_end`, those that run away from the viewer begin at -1 and
+    come to their origin at 0: of a time near 0 more digits are kept, and in 1 / z all that is
+    far away lies close to the end.
+    """
 
     ox: Float[Array, " ray"]
     oy: Float[Array, " ray"]
@@ -23,6 +29,7 @@ class Rays(NamedTuple):
     ix: Float[Array, " ray"]
     iy: Float[Array, " ray"]
     iz: Float[Array, " ray"]
+    from_end: bool = eqx.field(static=True)
 
 
 class Moment(NamedTuple):
@@ -32,13 +39,15 @@ class Moment(NamedTuple):
     after: Bool[Array, "..."]
 
 
-def rays(origin: Float[Array, "ray 3"], direction: Float[Array, "ray 3"]) -> Rays:
+def rays(
+    origin: Float[Array, "ray 3"], direction: Float[Array, "ray 3"], from_end: bool = False
+) -> Rays:
     """The rays, those parallel to an axis moved to the middle of their row or column."""
     dx, dy, dz = (jnp.where(d == 0, 0, d) for d in jnp.moveaxis(direction, -1, 0))
     ox, oy, oz = jnp.moveaxis(origin, -1, 0)
     ox = jnp.where(dx == 0, jnp.floor(ox) + 0.5, ox)
     oy = jnp.where(dy == 0, jnp.floor(oy) + 0.5, oy)
-    return Rays(ox, oy, oz, dx, dy, dz, 1 / dx, 1 / dy, 1 / dz)
+    return Rays(ox, oy, oz, dx, dy, dz, 1 / dx, 1 / dy, 1 / dz, from_end)
 
 
 def crossing(border: Array, o: Array, i: Array, backward: Array) -> Moment:
@@ -50,13 +59,32 @@ def crossing(border: Array, o: Array, i: Array, backward: Array) -> Moment:
 
 
 def came(r: Rays, x: Array, y: Array, left: Array, up: Array) -> tuple[Moment, Moment]:
-    """When a ray came into a column and into a row."""
+    """When a ray came into a column and into a row, were it without beginning."""
     return crossing(x + left, r.ox, r.ix, left), crossing(y + up, r.oy, r.iy, up)
 
 
-def start(r: Rays) -> Moment:
-    """Time 0."""
-    return Moment(jnp.zeros_like(r.ox), jnp.zeros(r.ox.shape, bool))
+def entered(r: Rays, came_x: Moment, came_y: Moment) -> Moment:
+    """When a ray is first in both a column and a row."""
+    last = latest(came_x, came_y)
+    time = since_start(last.time, r.iz, r.from_end)
+    return Moment(time, last.after & (last.time == time))
+
+
+def start(dz: Float[Array, "..."], from_end: bool) -> Float[Array, "..."]:
+    """The time at which rays begin."""
+    return since_start(jnp.full_like(dz, -jnp.inf), dz, from_end)
+
+
+def since_start(
+    time: Float[Array, "..."], dz: Float[Array, "..."], from_end: bool
+) -> Float[Array, "..."]:
+    """A time or, if it is earlier, that at which the ray begins; of `dz` the sign counts.
+
+    Of each the later is taken before one is chosen: XLA would carry the times at which rays
+    begin through the walk's loop, an array more to read in each step.
+    """
+    later = jnp.maximum(time, 0)
+    return jnp.where(dz > 0, jnp.maximum(time, -1), later) if from_end else later
 
 
 def earlier(one: Moment, other: Moment) -> Bool[Array, "..."]:
@@ -64,13 +92,11 @@ def earlier(one: Moment, other: Moment) -> Bool[Array, "..."]:
     return (one.time < other.time) | ((one.time == other.time) & ~one.after & other.after)
 
 
-def latest(moment: Moment, *others: Moment) -> Moment:
-    """The last of several moments."""
-    for other in others:
-        after = (moment.after | other.after) & (moment.time == other.time)
-        after = after | jnp.where(moment.time < other.time, other.after, moment.after)
-        moment = Moment(jnp.maximum(moment.time, other.time), after)
-    return moment
+def latest(one: Moment, other: Moment) -> Moment:
+    """The later of two moments."""
+    after = jnp.where(one.time < other.time, other.after, one.after)
+    after = jnp.where(one.time == other.time, one.after | other.after, after)
+    return Moment(jnp.maximum(one.time, other.time), after)
 
 
 def first(one: Moment, other: Moment) -> Moment:
@@ -101,13 +127,19 @@ class Entry(NamedTuple):
 
 
 def entry(r: Rays, height: int, width: int) -> Entry:
-    """Where a ray comes into the image, at time 0 at the earliest."""
+    """Where a ray comes into the image, when it begins at the earliest."""
     left, up = backward(r)
     edge_x, edge_y = left * (width - 1), up * (height - 1)
     enter_x, enter_y = came(r, edge_x, edge_y, left, up)
-    when = latest(start(r), enter_x, enter_y)
-    x = jnp.where(earlier(enter_x, when), cell_at(when, r.ox, r.dx, left), edge_x)
-    y = jnp.where(earlier(enter_y, when), cell_at(when, r.oy, r.dy, up), edge_y)
+    when = entered(r, enter_x, enter_y)
+    x = _beyond(edge_x, left, cell_at(when, r.ox, r.dx, left), earlier(enter_x, when))
+    y = _beyond(edge_y, up, cell_at(when, r.oy, r.dy, up), earlier(enter_y, when))
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     known = jnp.isfinite(r.ox + r.oy + r.oz) & jnp.isfinite(r.dx + r.dy + r.dz)
     return Entry(x, y, inside & known)
+
+
+def _beyond(edge: Array, backward: Array, cell: Array, has_passed: Array) -> Array:
+    """The row or column at the edge of the image or, past it, one inside, whatever rounding."""
+    inner = jnp.where(backward == 1, jnp.minimum(cell, edge), jnp.maximum(cell, edge))
+    return jnp.where(has_passed, inner, edge)

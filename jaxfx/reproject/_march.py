@@ -19,12 +19,13 @@ def descend(
     origin: Float[Array, "ray 3"],
     direction: Float[Array, "ray 3"],
     max_steps: int | None,
+    from_end: bool,
 ) -> Found:
     """From the pyramid's root to a leaf, on to a node's depth where the ray is nearer.
 
     No border is looked at: a node that the ray has left on its way may have held the hit.
     """
-    r, begin = _entering(depth, origin, direction)
+    r, begin = _entering(depth, origin, direction, from_end)
     pyramid = minimum_pyramid(depth)
     time, _ = _interval(depth, r, begin)
     levels = len(pyramid.shapes) if max_steps is None else min(len(pyramid.shapes), max_steps)
@@ -39,7 +40,7 @@ def descend(
     steps = jnp.where(begin.inside, levels, 0)
     mask = begin.inside & inside & meets
     complete = levels == len(pyramid.shapes)
-    return _found(depth, time, x, y, mask & complete, steps)._replace(
+    return _found(depth, r, time, x, y, mask & complete, steps)._replace(
         exhausted=begin.inside & (not complete)
     )
 
@@ -49,16 +50,17 @@ def linear(
     origin: Float[Array, "ray 3"],
     direction: Float[Array, "ray 3"],
     max_steps: int | None,
+    from_end: bool,
 ) -> Found:
     """Equal steps until the ray is behind the depth, then one secant."""
-    r, begin = _entering(depth, origin, direction)
+    r, begin = _entering(depth, origin, direction, from_end)
     before, after, found, steps = _first_behind(depth, r, begin, max_steps)
     gap_before, gap_after = (_gap(depth, r, time) for time in (before, after))
     known = found & jnp.isfinite(gap_before) & (gap_before < 0)
     slope = jnp.where(known, gap_after - gap_before, 1)
     share = jnp.where(known, -gap_before / slope, 1)
     time = before + share * (after - before)
-    return _found(depth, time, *_place(r, time), found, steps)
+    return _found(depth, r, time, *_place(r, time), found, steps)
 
 
 def relief(
@@ -66,9 +68,10 @@ def relief(
     origin: Float[Array, "ray 3"],
     direction: Float[Array, "ray 3"],
     max_steps: int | None,
+    from_end: bool,
 ) -> Found:
     """Equal steps until the ray is behind the depth, then bisection of the last."""
-    r, begin = _entering(depth, origin, direction)
+    r, begin = _entering(depth, origin, direction, from_end)
     before, after, found, steps = _first_behind(depth, r, begin, max_steps)
 
     def halve(_, ends):
@@ -79,11 +82,13 @@ def relief(
 
     _, time = jax.lax.fori_loop(0, _HALVINGS, halve, (before, after))
     steps = steps + jnp.where(found, _HALVINGS, 0)
-    return _found(depth, time, *_place(r, time), found, steps)
+    return _found(depth, r, time, *_place(r, time), found, steps)
 
 
-def _entering(depth: Array, origin: Array, direction: Array) -> tuple[Rays, Entry]:
-    r = _grid.rays(origin, direction)
+def _entering(
+    depth: Array, origin: Array, direction: Array, from_end: bool
+) -> tuple[Rays, Entry]:
+    r = _grid.rays(origin, direction, from_end)
     return r, _grid.entry(r, *depth.shape)
 
 
@@ -112,12 +117,13 @@ def _interval(depth: Array, r: Rays, begin: Entry) -> tuple[Array, Array]:
     height, width = depth.shape
     left, up = _grid.backward(r)
     x, y = (jnp.where(begin.inside, cell, 0) for cell in (begin.x, begin.y))
-    start = _grid.latest(_grid.start(r), *_grid.came(r, x, y, left, up)).time
+    start = _grid.entered(r, *_grid.came(r, x, y, left, up)).time
     leave_x = _grid.crossing((1 - left) * width, r.ox, r.ix, left).time
     leave_y = _grid.crossing((1 - up) * height, r.oy, r.iy, up).time
     farthest = jnp.max(jnp.where(depth < jnp.inf, depth, -jnp.inf))
     # With room for rounding: the last step is to be behind the farthest texel as well.
-    slack = 8 * jnp.finfo(depth.dtype).eps * (jnp.abs(farthest) + jnp.abs(r.oz))
+    terms = jnp.abs(farthest) + jnp.abs(r.oz) + jnp.abs(start * r.dz)
+    slack = 8 * jnp.finfo(depth.dtype).eps * terms
     behind = (farthest + slack - r.oz) * r.iz
     behind = jnp.where((r.dz > 0) & (farthest > -jnp.inf), behind, jnp.inf)
     end = jnp.minimum(jnp.minimum(leave_x, leave_y), behind)
@@ -147,7 +153,7 @@ def _gap(depth: Array, r: Rays, time: Array) -> Float[Array, " ray"]:
     return r.oz + time * r.dz - texel
 
 
-def _found(depth, time, x, y, mask, steps) -> Found:
+def _found(depth, r, time, x, y, mask, steps) -> Found:
     x, y = jnp.clip(x, 0, depth.shape[1] - 1), jnp.clip(y, 0, depth.shape[0] - 1)
-    side = jnp.where(time > 0, TOP, START)
+    side = jnp.where(time > _grid.start(r.dz, r.from_end), TOP, START)
     return Found(time, x, y, side, mask, steps.astype(jnp.int32), jnp.zeros_like(mask))

@@ -4,6 +4,11 @@ A line of the world stays a line in (x, y, -1 / z). A point at depth s along the
 p has the source's homogeneous pixel s m + b. For a pinhole, b is its eye and m = M p, with M
 the matrix of the two cameras at infinity. M is kept as its difference from the identity, which
 is 0 for two equal cameras: their rays then stay on their pixels, without rounding.
+
+As s grows the point moves along m b_z - b m_z in x and y, and along m_z in -1 / z. This needs
+no two points of the line, whose difference has no digits left where one is at the near plane
+and the other far away. Lengths are in units of the near plane's depth, which holds the numbers
+of any scene within the range of float32.
 """
 
 from typing import NamedTuple
@@ -20,7 +25,11 @@ _Point = tuple[Array, Array, Array]
 
 
 class ViewRays(NamedTuple):
-    """Rays in (x, y, -1 / z) that run from t = 0 to 1, and which of them are in the frustum."""
+    """Rays in (x, y, -unit / z), and which of them are in the frustum.
+
+    Those that run away from the source have their origin at their far end, and go from t = -1
+    to 0; the others from 0 to 1.
+    """
 
     origin: Float[Array, "ray 3"]
     direction: Float[Array, "ray 3"]
@@ -33,20 +42,22 @@ def view_rays(
     pixels: Float[Array, "ray 2"],
     *,
     shape: tuple[int, int],
-    near: Float[Array, ""],
+    unit: Float[Array, ""],
 ) -> ViewRays:
-    """The rays of some target pixels, clipped to the source's frustum beyond `near`."""
-    far, eye = _lines(source, target, pixels)
-    begin, end = _clip(far, eye, shape, near)
-    start, stop = (_point(far, eye, jax.lax.stop_gradient(s)) for s in (begin, end))
-    origin = jnp.stack(start, axis=-1)
-    direction = jnp.stack([b - a for a, b in zip(start, stop, strict=True)], axis=-1)
+    """The rays of some target pixels, clipped to the source's frustum beyond a depth `unit`."""
+    far, eye = _lines(source, target, pixels, unit)
+    begin, end = _clip(far, eye, shape)
+    direction = _direction(far, eye, begin, end)
+    runs_away = jax.lax.stop_gradient(direction[:, 2]) > 0
+    origin = _point(far, eye, jnp.where(runs_away, end, begin))
     inside = (begin < end) & jnp.isfinite(origin + direction).all(axis=-1)
     origin, direction = (jnp.where(inside[:, None], x, 0) for x in (origin, direction))
     return ViewRays(origin, direction, inside)
 
 
-def _lines(source: PinholeCamera, target: Camera, pixels: Array) -> tuple[_Point, _Point]:
+def _lines(
+    source: PinholeCamera, target: Camera, pixels: Array, unit: Array
+) -> tuple[_Point, _Point]:
     """What is multiplied by the depth in the target, and what is added: m and b."""
     dtype = pixels.dtype
     lens, turn = (
@@ -54,7 +65,7 @@ def _lines(source: PinholeCamera, target: Camera, pixels: Array) -> tuple[_Point
         source.world_from_camera[:3, :3].T.astype(dtype),
     )
     pose = target.world_from_camera.astype(dtype)
-    away = pose[:3, 3] - source.world_from_camera[:3, 3].astype(dtype)
+    away = (pose[:3, 3] - source.world_from_camera[:3, 3].astype(dtype)) / unit
     x, y = pixels[:, 0], pixels[:, 1]
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     apart = turn @ (pose[:3, :3] - turn.T)
@@ -66,7 +77,7 @@ def _lines(source: PinholeCamera, target: Camera, pixels: Array) -> tuple[_Point
         apart = lens @ (apart + jnp.eye(3, dtype=dtype))
         own, eye = (zero, zero, zero), lens @ (turn @ away)
         scale, centre = target.pixels_per_unit.astype(dtype), target.centre.astype(dtype)
-        plane = (x - centre[0]) / scale, (y - centre[1]) / scale
+        plane = (x - centre[0]) / scale / unit, (y - centre[1]) / scale / unit
         x, y = zero, zero
     far = [row[0] * x + row[1] * y + row[2] + its for row, its in zip(apart, own, strict=True)]
     near = [
@@ -75,7 +86,7 @@ def _lines(source: PinholeCamera, target: Camera, pixels: Array) -> tuple[_Point
     return tuple(far), tuple(near)
 
 
-def _clip(far: _Point, eye: _Point, shape: tuple[int, int], near: Array) -> tuple[Array, Array]:
+def _clip(far: _Point, eye: _Point, shape: tuple[int, int]) -> tuple[Array, Array]:
     """From which target depth to which a line is in the frustum: a r + b >= 0 for each side."""
     height, width = shape
     hold = jax.lax.stop_gradient
@@ -86,7 +97,7 @@ def _clip(far: _Point, eye: _Point, shape: tuple[int, int], near: Array) -> tupl
         (width * z - x, width * eye_z - eye_x),
         (y, eye_y),
         (height * z - y, height * eye_z - eye_y),
-        (z, eye_z - hold(near)),
+        (z, eye_z - 1),
     ]
     begin, end = jnp.zeros_like(x), jnp.full_like(x, jnp.inf)
     for grows, at_eye in sides:
@@ -97,10 +108,21 @@ def _clip(far: _Point, eye: _Point, shape: tuple[int, int], near: Array) -> tupl
     return begin, end
 
 
-def _point(far: _Point, eye: _Point, depth: Array) -> _Point:
+def _direction(far: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, "ray 3"]:
+    """How (x, y, -1 / z) of the source changes from one depth of the target to another."""
+    hold = jax.lax.stop_gradient
+    (x, y, z), (eye_x, eye_y, eye_z) = far, eye
+    inverse = 1 / end
+    start, stop = (hold(v) for v in (z * begin + eye_z, z + inverse * eye_z))
+    length = (1 - begin * inverse) / (jnp.maximum(start, 1) * stop)
+    along = (x * eye_z - eye_x * z, y * eye_z - eye_y * z, z)
+    return jnp.stack(along, axis=-1) * length[:, None]
+
+
+def _point(far: _Point, eye: _Point, depth: Array) -> Float[Array, "ray 3"]:
     """(x, y, -1 / z) of the source at a depth of the target, 0 and infinity among them."""
     at_eye = depth == 0
     inverse = 1 / jnp.where(at_eye, 1, depth)
     x, y, z = (jnp.where(at_eye, e, f + inverse * e) for f, e in zip(far, eye, strict=True))
     z = jnp.where(z > 0, z, 1)
-    return x / z, y / z, -jnp.where(at_eye, 1, inverse) / z
+    return jnp.stack([x / z, y / z, -jnp.where(at_eye, 1, inverse) / z], axis=-1)

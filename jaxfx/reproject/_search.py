@@ -24,23 +24,28 @@ def search(
     direction: Float[Array, "ray 3"],
     method: str,
     max_steps: int | None,
+    *,
+    from_end: bool = False,
 ) -> Found:
     """Where each ray first meets the depth, a texel of which is +inf where nothing is.
 
-    Integer work: nothing is differentiated, and no derivative's pass meets its loops.
+    Integer work: nothing is differentiated, and no derivative's pass meets its loops. When rays
+    begin, `_grid.Rays` says. The time of a miss is 0: a derivative multiplies it by 0, and an
+    infinite one would make that NaN.
     """
     held = map(jax.lax.stop_gradient, (depth, origin, direction))
-    return _searcher(method, max_steps)(*held)
+    found = _searcher(method, max_steps, from_end)(*held)
+    return found._replace(time=jnp.where(found.mask, found.time, 0))
 
 
 _FOUND = jax.tree.structure(Found(*Found._fields))  # pyright: ignore[reportArgumentType]
 
 
 @functools.cache
-def _searcher(method: str, max_steps: int | None):
+def _searcher(method: str, max_steps: int | None, from_end: bool):
     @jax.custom_batching.custom_vmap
     def one(depth, origin, direction):
-        return METHODS[method](depth, origin, direction, max_steps)
+        return METHODS[method](depth, origin, direction, max_steps, from_end)
 
     @one.def_vmap
     def many(size, batched, depth, origin, direction):

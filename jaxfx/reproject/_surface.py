@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfx.reproject import _grid
 from jaxfx.reproject._found import TOP, X_SIDE, Y_SIDE, Found
 from jaxfx.reproject._patch import patch
 
@@ -53,7 +54,13 @@ def _texel_miss(
 
 
 def bilinear_point(
-    depth: Array, origin: Array, direction: Array, found: Found, threshold: int | float | None
+    depth: Array,
+    origin: Array,
+    direction: Array,
+    found: Found,
+    threshold: int | float | None,
+    *,
+    from_end: bool = False,
 ) -> Point:
     """The hit on the patch through the texels' centres, near the one that was found.
 
@@ -73,7 +80,8 @@ def bilinear_point(
     )
     per_texel = jnp.maximum(jnp.abs(d[:, 0]), jnp.abs(d[:, 1]))
     reach = jnp.where(per_texel > 0, _REACH / jnp.where(per_texel > 0, per_texel, 1), jnp.inf)
-    low, high = jnp.maximum(found.time - reach, 0), found.time + reach
+    low = _grid.since_start(found.time - reach, d[:, 2], from_end)
+    high = found.time + reach
 
     def newton(step, state):
         time, last, _ = state

@@ -71,13 +71,14 @@ def step(pyramid: Pyramid, r: Rays, state: UInt32[Array, " ray"]) -> UInt32[Arra
     leave_x = _grid.crossing(border_x, r.ox, r.ix, left)
     leave_y = _grid.crossing(border_y, r.oy, r.iy, up)
     leave = _grid.first(leave_x, leave_y)
-    now = _grid.latest(_grid.start(r), *_grid.came(r, x, y, left, up))
+    now = _grid.entered(r, *_grid.came(r, x, y, left, up))
     # A ray parallel to the image reaches a depth at once, -inf or NaN, or at +inf: never.
     reach = (nearest - r.oz) * r.iz
-    ahead = (r.iz > 0) & (now.time < reach)
+    sinks = r.iz > 0
+    ahead = sinks & (now.time < reach)
     at = Moment(jnp.where(ahead, reach, now.time), now.after & ~ahead)
     sinks_in_time = (now.time < reach) | ((now.time == reach) & ~now.after)
-    reached = jnp.where(r.iz > 0, _grid.earlier(at, leave), sinks_in_time) & (nearest < jnp.inf)
+    reached = jnp.where(sinks, _grid.earlier(at, leave), sinks_in_time) & (nearest < jnp.inf)
 
     # The texel in which the ray is next: where it reaches the depth, or beyond the border.
     go = Moment(jnp.where(reached, reach, leave.time), leave.after & ~reached)
@@ -112,6 +113,7 @@ def walk(
     origin: Float[Array, "ray 3"],
     direction: Float[Array, "ray 3"],
     max_steps: int | None,
+    from_end: bool,
 ) -> Found:
     """The first texel that every ray reaches in depth."""
     pyramid = minimum_pyramid(depth)
@@ -121,7 +123,8 @@ def walk(
     thickness = jnp.max(jnp.where(finite, depth, -jnp.inf)) - nearest
 
     def together(rays):
-        r = _grid.rays(*rays)
+        begin, along = rays
+        r = _grid.rays(begin, along, from_end)
         state, steps = _begin(pyramid, thickness, r)
         return _end(pyramid, r, *_walk(pyramid, r, state, steps, limit))
 
@@ -159,12 +162,12 @@ def _end(pyramid: Pyramid, r: Rays, state: Array, steps: Array) -> Found:
     """When and how a ray meets the texel in which it is."""
     x, y, level, left, up = unpack(state)
     when_x, when_y = _grid.came(r, x, y, left, up)
-    now = _grid.latest(_grid.start(r), when_x, when_y).time
+    now = _grid.entered(r, when_x, when_y).time
     texel = pyramid.values.at[y * pyramid.shapes[0][1] + x].get(mode="promise_in_bounds")
     reach = (texel - r.oz) * r.iz
     on_top = (r.iz > 0) & (reach >= now)
     side = jnp.where(when_x.time == now, X_SIDE, Y_SIDE)
-    side = jnp.where(now == 0, START, side)
+    side = jnp.where(now == _grid.start(r.dz, r.from_end), START, side)
     return Found(
         time=jnp.where(on_top, reach, now),
         x=x,
@@ -201,7 +204,7 @@ def _walk(pyramid, r, state, steps, max_steps):
         chosen = jnp.full(few, count, jnp.int32).at[place].set(numbers, mode="drop")
         take = lambda x: x.at[chosen].get(mode="fill", fill_value=0)
         rest = jnp.where(chosen < count, take(state), jnp.uint32(MISS << (2 * _BITS + 2)))
-        ends = _walk(pyramid, Rays(*map(take, r)), rest, take(steps), max_steps)
+        ends = _walk(pyramid, jax.tree.map(take, r), rest, take(steps), max_steps)
         state, steps = (
             x.at[chosen].set(end, mode="drop")
             for x, end in zip((state, steps), ends, strict=True)

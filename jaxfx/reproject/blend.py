@@ -13,6 +13,7 @@ from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, wh
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
+from jaxfx.camera._rigid import per_depth
 from jaxfx.reproject._rays import Camera
 from jaxfx.reproject._view import View, look
 from jaxfx.reproject.intersect import Method
@@ -116,7 +117,7 @@ def choose(
 
     **Arguments:**
 
-    - `depths`: the depth of each source, height width, scene units.
+    - `depths`: the depth of each source, height width, scene units, as in `warp`.
     - `sources`: the camera of each.
     - `target`: the camera to see them from.
     - `count`: static; how many to choose.
@@ -222,16 +223,15 @@ class Sight(eqx.Module):
         """The view, the cosine between the source's rays and the target's, and its depth."""
         pixels = self.pixels.astype(depth.dtype)
         view = look(depth, source, self.target, pixels, **self.options)
+        rays, others = per_depth(source, view.pixels), per_depth(self.target, pixels)
+        cosine = jnp.sum(normalize(rays) * normalize(others), axis=-1)
+        # No point of the world: its square overflows where a sky is at 1e20.
         at_infinity = view.inverse_depth <= 0
-        points = source.unproject(
-            view.pixels, 1 / jnp.where(at_infinity, 1, view.inverse_depth)
+        poses = source.world_from_camera, self.target.world_from_camera
+        axis, away = poses[1][:3, 2], poses[0][:3, 3] - poses[1][:3, 3]
+        along, offset = (
+            jnp.sum(v * axis[None].astype(v.dtype), axis=-1)
+            for v in (rays, away[None].astype(rays.dtype))
         )
-        nowhere = jnp.zeros_like(view.inverse_depth)
-        rays = (
-            normalize(points - source.unproject(view.pixels, nowhere)),
-            normalize(points - self.target.unproject(pixels, nowhere)),
-        )
-        cosine = jnp.maximum(jnp.sum(rays[0] * rays[1], axis=-1), 0)
-        _, there = self.target.project(points)
-        along = jnp.where(at_infinity, 1, cosine)
-        return view, along, jnp.where(at_infinity, jnp.inf, there)
+        there = along / jnp.where(at_infinity, 1, view.inverse_depth) + offset
+        return view, jnp.maximum(cosine, 0), jnp.where(at_infinity, jnp.inf, there)

@@ -42,8 +42,9 @@ def warp(
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the source's axis, inf for background. NaN and 0
-      are holes: rays pass through them, and nothing is read from them.
+    - `depth`: height width, scene units along the source's axis, inf for background. What is 0,
+      negative or NaN is missing: a hole, at whose border a surface ends. Rays pass through it
+      to what is known beyond, and nothing is read from it.
     - `source`: the camera that took the picture, a pinhole.
     - `target`: the camera to see it from, a pinhole or an orthographic one.
     - `shape`: static; height and width of the result in pixels, the picture's own by default.
@@ -53,8 +54,8 @@ def warp(
       holes in slanted surfaces, larger draws skins between things.
 
     **Returns:** `image`, rows columns channel, in the type of `image`, 0 where nothing is
-    known; and `alpha`, rows columns: 1, or 0 where the ray leaves the frustum or goes through
-    a gap.
+    known; and `alpha`, rows columns: 1, or 0 where the ray leaves the frustum, goes through a
+    gap or ends in a hole.
 
     **Raises:** `ValueError` for a wrong shape or size, a camera of another kind, an unknown
     method or a threshold that is not positive.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfx._extras import needs
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
 
@@ -74,8 +75,9 @@ def unobstructed(
 
 def _accelerated(scene: Scene) -> Any:
     if scene not in _built:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
+        with needs("scene"):
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
 
         robust = EmbreeScene(robust=True)
         TriangleMesh(robust, scene.unit_triangles)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfx._extras import needs
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
 
@@ -40,7 +41,7 @@ void main() {
 
 # A context belongs to a thread: this one alone speaks to OpenGL.
 _thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="jaxfx.scene.opengl")
-_NEAREST = 1e-6  # the near plane, of the scene's scale
+_TILE = 4096  # pixels a side that are drawn at once; OpenGL's own limit may be less
 
 
 @cache
@@ -62,11 +63,26 @@ def first_faces(
     scene: Scene, view: View, start: Float[np.ndarray, "height width"]
 ) -> Int[np.ndarray, "height width"]:
     """The first face past the depth `start` at each pixel's centre; -1 where there is none."""
+    faces = np.empty(start.shape, np.int32)
+    side = _thread.submit(lambda: _rasterizer().side).result()
+    for row in range(0, start.shape[0], side):
+        for column in range(0, start.shape[1], side):
+            tile = slice(row, row + side), slice(column, column + side)
+            moved = np.eye(3)
+            moved[:2, 2] = -column, -row
+            part = view._replace(intrinsics=moved @ view.intrinsics)
+            faces[tile] = _faces_of_tile(scene, part, start[tile])
+    return faces
+
+
+def _faces_of_tile(
+    scene: Scene, view: View, start: Float[np.ndarray, "height width"]
+) -> Int[np.ndarray, "height width"]:
     height, width = start.shape
     clip, depth, farthest = _transforms(scene, view, height, width)
     if farthest <= 0:
         return np.full((height, width), -1, np.int32)
-    unit_start = (start / scene.scale).astype(np.float32)
+    unit_start = np.ascontiguousarray(start / scene.scale, np.float32)
     draw = lambda: _rasterizer().draw(scene, clip, depth, farthest, unit_start)
     return _thread.submit(draw).result()
 
@@ -76,8 +92,9 @@ def _transforms(
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4"], float]:
     """From unit triangles to clip space and to depth, both in units of the scene's scale.
 
-    Then the largest depth in the scene. Clip space's y points down, as a picture's does, so
-    that the framebuffer's first row is the top one.
+    Then the largest depth in the scene. Clip space's y points down, as an image's does, so
+    that the framebuffer's first row is the top one. Its z is 0 in perspective: there is no near
+    plane but the eye, and the fragments' own depth decides what is in front.
     """
     rotation, eye = view.world_from_camera[:3, :3], view.world_from_camera[:3, 3]
     offset = rotation.T @ (scene.centre - eye) / scene.scale
@@ -86,7 +103,7 @@ def _transforms(
     box = (scene.bounds - scene.centre) / scene.scale
     farthest = 1.0001 * float(np.maximum(*(box * depth[:3])).sum() + depth[3])
     if view.perspective:
-        w, z = depth, depth - 2 * _NEAREST * one
+        w, z = depth, 0 * depth
         u, v, _ = view.intrinsics @ np.stack([x, y, depth])
     else:
         w, z = one, 2 * depth / max(farthest, 1e-30) - one
@@ -103,9 +120,10 @@ class _Rasterizer:
     """A context, a program, and the buffers of the scene and size drawn last."""
 
     def __init__(self):
-        import pyrender
-        from OpenGL import GL
-        from OpenGL.GL import shaders
+        with needs("scene"):
+            import pyrender
+            from OpenGL import GL
+            from OpenGL.GL import shaders
 
         self.gl = GL
         self.context = pyrender.OffscreenRenderer(1, 1)
@@ -114,6 +132,8 @@ class _Rasterizer:
             shaders.compileShader(_FRAGMENT, GL.GL_FRAGMENT_SHADER),
             validate=False,
         )
+        limits = (GL.GL_MAX_RENDERBUFFER_SIZE, GL.GL_MAX_TEXTURE_SIZE)
+        self.side = min(_TILE, *(int(GL.glGetIntegerv(limit)) for limit in limits))
         self.vertex_array = GL.glGenVertexArrays(1)
         self.corners = GL.glGenBuffers(1)
         self.framebuffer = GL.glGenFramebuffers(1)

@@ -22,6 +22,7 @@ _logger = logging.getLogger("jaxfx.scene")
 _Camera = PinholeCamera | OrthographicCamera
 _FirstFaces = Callable[[Scene, View, np.ndarray], np.ndarray]
 _BACKENDS = {"opengl": _opengl, "embree": _embree}
+_COARSE = 1e-3  # of the scene's scale: a rounding of the camera's place to speak of
 _GAP = 1e-5  # between layers, of their depth and of the scene's scale
 
 
@@ -160,12 +161,28 @@ def _visible(
         )
     name, expected = f"scene.{caller}(layer=...)", "an integer from 0"
     layer = whole_number(name, layer, lambda n: n >= 0, expected)
+    _warn_of_rounding(scene, camera, caller)
     first_faces = _backend(caller, backend)
     hits = intersect(scene, view, first_faces(scene, view, np.zeros((height, width))))
     for _ in range(layer):
         faces = _next_faces(first_faces, scene, view, hits, (height, width))
         hits = intersect(scene, view, faces)
     return view, hits, (height, width)
+
+
+def _warn_of_rounding(scene: Scene, camera: _Camera, caller: str) -> None:
+    """Say where a camera's numbers have not kept its place to a thousandth of the scene."""
+    pose = np.asarray(camera.world_from_camera)
+    rounding = float(np.spacing(np.abs(pose[:3, 3]).max())) / 2
+    if rounding > _COARSE * scene.scale:
+        _logger.warning(
+            "scene.%s(camera): the camera's place is rounded to %.2g in %s, where the scene is "
+            "%.2g in size: move both to the origin, or set jax_enable_x64",
+            caller,
+            rounding,
+            pose.dtype,
+            2 * scene.scale,
+        )
 
 
 def _next_faces(

@@ -1,58 +1,13 @@
 """A scene: triangles with their attributes and materials, as NumPy arrays."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, final
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
-
-@final
-@dataclass(frozen=True, eq=False)
-class Material:
-    """What a surface is made of, in the terms of glTF 2.0.
-
-    **Arguments:**
-
-    - `color`: linear RGB; the corners' colours and the texture multiply it.
-    - `texture`: height width 3, sRGB bytes, row 0 at the top; or None.
-    - `metallic`, `roughness`: in [0, 1].
-    - `metallic_roughness`: height width 3, linear bytes that multiply the two: roughness in
-      green, metallic in blue; or None.
-    - `normal_map`: height width 3, linear bytes; 2 * value - 1 is the normal along u, along v
-      and off the surface; or None.
-
-    **Raises:** `ValueError` for a number out of range or another kind of picture.
-
-    **Gradient:** none: these are the host's numbers.
-    """
-
-    color: Sequence[float | int] = (1.0, 1.0, 1.0)
-    texture: UInt8[np.ndarray, "height width 3"] | None = None
-    metallic: float | int = 0.0
-    roughness: float | int = 1.0
-    metallic_roughness: UInt8[np.ndarray, "rows columns 3"] | None = None
-    normal_map: UInt8[np.ndarray, "lines samples 3"] | None = None
-
-    def __post_init__(self):
-        if np.shape(self.color) != (3,) or not np.isfinite(self.color).all():
-            raise ValueError(f"`Material(color=...)` must be linear RGB, got {self.color}.")
-        for name in ("metallic", "roughness"):
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise ValueError(f"`Material({name}=...)` must be in [0, 1], got {value}.")
-        for name in ("texture", "metallic_roughness", "normal_map"):
-            picture = getattr(self, name)
-            if picture is None:
-                continue
-            shape, dtype = np.shape(picture), np.asarray(picture).dtype
-            if len(shape) != 3 or shape[2] != 3 or 0 in shape or dtype != np.uint8:
-                raise ValueError(
-                    f"`Material({name}=...)` must hold bytes of shape (height, width, 3), "
-                    f"got {dtype} of shape {shape}."
-                )
+from jaxfx.scene._material import Material
 
 
 class Viewpoint(NamedTuple):
@@ -84,13 +39,16 @@ class Scene:
     - `vertices`: vertex 3, world positions, in scene units.
     - `faces`: face 3, indices of vertices; counter-clockwise seen from the front.
     - `normals`: face 3 3, each corner's normal, in world space. Their sign does not matter.
-    - `uv`: face 3 2, each corner's texture coordinates; v points up, whole numbers repeat.
+    - `uv`: face 3 2, each corner's texture coordinates; v points up, and the image covers
+      [0, 1] of both.
     - `colors`: face 3 3, each corner's linear RGB, which multiplies the material's.
     - `materials`, `face_materials`: the materials, and every face's index into them.
     - `names`, `face_objects`: the objects' names, and every face's index into them.
     - `viewpoint`: what `default_camera` takes, where the scene knows better than its box.
+    - `second_uv`: face 3 2, the coordinates of textures whose `Sampler` asks for a second set;
+      or None.
 
-    **Raises:** `ValueError` where there is no triangle, a vertex is not finite, or the arrays
+    **Raises:** `ValueError` where there is no triangle, a number is not finite, or the arrays
     do not fit one another.
 
     **Gradient:** none: scenes live on the host, in NumPy.
@@ -106,6 +64,7 @@ class Scene:
     names: tuple[str, ...]
     face_objects: Int[np.ndarray, " face"]
     viewpoint: Viewpoint | None = None
+    second_uv: Float[np.ndarray, "face 3 2"] | None = None
 
     def __post_init__(self):
         count = len(self.faces)
@@ -119,23 +78,36 @@ class Scene:
             "colors": ((count, 3, 3), np.float32),
             "face_materials": ((count,), np.int32),
             "face_objects": ((count,), np.int32),
+            "second_uv": ((count, 3, 2), np.float32),
         }.items():
             value = getattr(self, name)
+            if name == "second_uv" and value is None:
+                continue
             if np.shape(value) != shape:
                 raise ValueError(
                     f"`Scene({name}=...)` must have shape {shape}, got {np.shape(value)}."
                 )
-            copied = np.array(value, dtype, order="C")
+            with np.errstate(over="ignore"):  # found by the next check
+                copied = np.array(value, dtype, order="C")
+            self._require_finite(name, copied)
             copied.flags.writeable = False
             object.__setattr__(self, name, copied)
         self._require_index("faces", len(self.vertices))
         self._require_index("face_materials", len(self.materials))
         self._require_index("face_objects", len(self.names))
-        wrong = ~np.isfinite(self.vertices).all(axis=1)
-        if wrong.any():
+        asked = [s for each in self.materials for s in each.samplers.values() if s.second_uv]
+        if asked and self.second_uv is None:
             raise ValueError(
-                f"`Scene(vertices=...)` must be finite, got {self.vertices[wrong][0]} at "
-                f"vertex {wrong.argmax()}; {wrong.sum()} of {wrong.size} are wrong."
+                "`Scene(second_uv=...)` must be given for a `Sampler` that reads it, got None."
+            )
+
+    def _require_finite(self, name: str, value: np.ndarray) -> None:
+        wrong = ~np.isfinite(value).reshape(len(value), -1).all(axis=1)
+        if wrong.any():
+            item = "vertex" if name == "vertices" else "face"
+            raise ValueError(
+                f"`Scene({name}=...)` must be finite, got {value[wrong][0].tolist()} at "
+                f"{item} {wrong.argmax()}; {wrong.sum()} of {wrong.size} are wrong."
             )
 
     def _require_index(self, name: str, count: int) -> None:

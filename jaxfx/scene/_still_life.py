@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfx.scene._scene import Material, Scene, Viewpoint
+from jaxfx._extras import needs
+from jaxfx.scene._material import Material
+from jaxfx.scene._scene import Scene, Viewpoint
 
 
 _Corners = Float[np.ndarray, "face 3 3"]
@@ -28,7 +30,8 @@ def still_life() -> Scene:
 
     **Gradient:** none: this runs on the host.
     """
-    from trimesh import creation
+    with needs("scene"):
+        from trimesh import creation
 
     parts = _Parts()
     _room(parts, creation)

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfx.gbuffer import GBuffer
-from jaxfx.scene._color import LINEAR, SRGB, read_texture
+from jaxfx.scene._color import read_texture
+from jaxfx.scene._material import Material, Sampler
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
 
@@ -160,27 +161,29 @@ def _bent(
         if material.normal_map is None or not len(at):
             continue
         face, up = hits.face[at], normal[:, at]
-        along_u, along_v, spans = _tangents(scene, face)
+        sampler = _sampler(material, "normal_map")
+        along_u, along_v, spans = _tangents(scene, face, sampler)
         tangent = along_u - _dot(up, along_u) * up
         length = np.sqrt(_dot(tangent, tangent))
         spans &= length > 0
         tangent = tangent / np.where(spans, length, 1)
         across = _cross(up, tangent)
         across = across * np.where(_dot(across, along_v) < 0, -1, 1)
-        uv = _interpolate(scene.uv, face, hits.weights[:, at]).T
-        x, y, z = 2 * read_texture(material.normal_map, uv, LINEAR).T - 1
-        bent = x * tangent + y * across + z * up
+        x, y, z = 2 * _read(scene, material, "normal_map", face, hits.weights[:, at]).T - 1
+        scale = np.float32(material.normal_scale)
+        bent = scale * (x * tangent + y * across) + z * up
         spans &= _dot(bent, bent) > 0
         normal[:, at] = np.where(spans, _unit(np.where(spans, bent, up)), up)
     return normal
 
 
 def _tangents(
-    scene: Scene, face: Int[np.ndarray, " hit"]
+    scene: Scene, face: Int[np.ndarray, " hit"], sampler: Sampler
 ) -> tuple[Float[np.ndarray, "3 hit"], Float[np.ndarray, "3 hit"], Bool[np.ndarray, " hit"]]:
     """The ways in which u and v grow on each face, in world space; and whether they do."""
     a, b, c = scene.vertices[scene.faces[face]].transpose(1, 2, 0)
-    (u_a, v_a), (u_b, v_b), (u_c, v_c) = scene.uv[face].astype(np.float64).transpose(1, 2, 0)
+    corners = _coordinates(sampler, _uv(scene, sampler)[face].astype(np.float64))
+    (u_a, v_a), (u_b, v_b), (u_c, v_c) = corners.transpose(1, 2, 0)
     area = (u_b - u_a) * (v_c - v_a) - (u_c - u_a) * (v_b - v_a)
     sign = np.sign(area)
     along_u = sign * ((v_c - v_a) * (b - a) - (v_b - v_a) * (c - a))
@@ -194,7 +197,6 @@ def _materials(
 ) -> tuple[Float[np.ndarray, "hit 3"], Float[np.ndarray, " hit"], Float[np.ndarray, " hit"]]:
     """Base colour, metallic and roughness of every hit, in float32."""
     color = _interpolate(scene.colors, hits.face, hits.weights).T
-    uv = _interpolate(scene.uv, hits.face, hits.weights).T
     metallic = np.empty(len(color), np.float32)
     roughness = np.empty(len(color), np.float32)
     index = scene.face_materials.take(hits.face)
@@ -203,14 +205,49 @@ def _materials(
         at = np.flatnonzero(index == each)
         factor = np.array(material.color, np.float32)
         metallic[at], roughness[at] = material.metallic, material.roughness
+        read = partial(_read, scene, material, face=hits.face[at], weights=hits.weights[:, at])
         if material.texture is not None:
-            factor = factor * read_texture(material.texture, uv[at], SRGB)
+            factor = factor * read("texture")
         if material.metallic_roughness is not None:
-            both = read_texture(material.metallic_roughness, uv[at], LINEAR)
+            both = read("metallic_roughness")
             roughness[at] *= both[:, 1]
             metallic[at] *= both[:, 2]
         color[at] *= factor
     return color, metallic, roughness
+
+
+def _sampler(material: Material, name: str) -> Sampler:
+    return material.samplers.get(name, Sampler())
+
+
+def _uv(scene: Scene, sampler: Sampler) -> Float[np.ndarray, "face 3 2"]:
+    if sampler.second_uv and scene.second_uv is not None:
+        return scene.second_uv
+    return scene.uv
+
+
+def _coordinates(
+    sampler: Sampler, uv: Float[np.ndarray, "*point 2"]
+) -> Float[np.ndarray, "*point 2"]:
+    """Where the texture is read for texture coordinates of the scene."""
+    turn = np.asarray(sampler.transform, uv.dtype)
+    if np.array_equal(turn, np.eye(2, 3)):
+        return uv
+    return uv @ turn[:, :2].T + turn[:, 2]
+
+
+def _read(
+    scene: Scene,
+    material: Material,
+    name: str,
+    face: Int[np.ndarray, " hit"],
+    weights: Float[np.ndarray, "3 hit"],
+) -> Float[np.ndarray, "hit 3"]:
+    """The material's texture of that name at the hits."""
+    sampler = _sampler(material, name)
+    uv = _coordinates(sampler, _interpolate(_uv(scene, sampler), face, weights).T)
+    texture = getattr(material, name)
+    return read_texture(texture, uv, srgb=name == "texture", sampler=sampler)
 
 
 def _interpolate(

@@ -5,6 +5,7 @@ receiver that is lit whatever the map says reads such texels only. Then no filte
 tell apart: it reads the texels about each place and compares them with its threshold.
 """
 
+import functools as ft
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -23,6 +24,9 @@ Kernel = Literal["box", "tent", "gaussian"]
 _UNROLLED = 9
 # Rows of texels are read in multiples of so many.
 LANES = 8
+# What a bias that is left out has to spare: texels of slope, for places that are rounded and
+# vertices that a rasteriser snaps to a grid; and a share of the depth, for rounding before it.
+_SPARE_TEXELS, _SPARE_DEPTH = 1 / 32, 2e-6
 
 
 class Places(NamedTuple):
@@ -49,8 +53,14 @@ def checked(
     *,
     size: Any = 1,
     kernel: Any = "box",
+    middle: float | None = None,
 ) -> tuple[Any, ...]:
-    """The five arguments that the filters share, as arrays; `ValueError` names a wrong one."""
+    """The five arguments that the filters share, as arrays; `ValueError` names a wrong one.
+
+    Where both biases are left out, the receivers' slope becomes the bias that the filter needs,
+    and the slope bias 1. `middle` is for a filter that compares the mean of its texels' depths:
+    how many texels its middle may lie from a receiver, along an axis.
+    """
     shadow_map = check_map(f"{function}(shadow_map)", shadow_map)
     if not isinstance(receivers, Receivers):
         kind = type(receivers).__name__
@@ -67,16 +77,39 @@ def checked(
                 f"`{function}(receivers)` must hold images of one shape (height, width), "
                 f"got {field.shape} for `{name}`."
             )
-    check_size(f"{function}(size=...)", size)
+    size = check_size(f"{function}(size=...)", size)
     option(f"{function}(kernel=...)", kernel, get_args(Kernel))
+    if softness is not None:
+        softness = parameter(f"{function}(softness=...)", softness)
+        check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
+    receivers = Receivers(*fields)
+    if bias is None and slope_bias is None:
+        # The farthest texel that is compared; and the terms of a sum that rounds.
+        reach, terms = (size / 2, 1) if middle is None else (middle, size)
+        needed = _needed_bias(shadow_map.dtype, reach, terms, receivers, softness)
+        receivers, slope_bias = receivers._replace(slope=needed), 1.0
+    bias, slope_bias = (0.0 if each is None else each for each in (bias, slope_bias))
     bias = parameter(f"{function}(bias=...)", bias)
     slope_bias = parameter(f"{function}(slope_bias=...)", slope_bias)
     for name, number in (("bias", bias), ("slope_bias", slope_bias)):
         check(f"{function}({name}=...)", number, np.isfinite, "finite")
-    if softness is not None:
-        softness = parameter(f"{function}(softness=...)", softness)
-        check(f"{function}(softness=...)", softness, lambda v: v > 0, "positive, or None")
-    return shadow_map, Receivers(*fields), bias, slope_bias, softness
+    return shadow_map, receivers, bias, slope_bias, softness
+
+
+@ft.partial(jax.jit, static_argnums=(0, 1, 2))
+def _needed_bias(map_dtype, reach, terms, receivers, softness):
+    """How much nearer than a receiver the texels of its own plane may be, in scene units.
+
+    Parallel light meets a plane at a depth that is linear in u and v: `reach` texels away along
+    both axes it is `reach * slope` less. A lamp meets it at a depth that is convex in them, and
+    so nowhere nearer than that.
+    """
+    dtype = working_dtype(map_dtype, *(field.dtype for field in receivers))
+    z, slope = receivers.z.astype(dtype), receivers.slope.astype(dtype)
+    types = (map_dtype, receivers.z.dtype, *terms * (dtype,))
+    rounding = sum(float(jnp.finfo(each).eps) for each in types) + _SPARE_DEPTH
+    needed = (reach + _SPARE_TEXELS) * slope + rounding * z
+    return needed if softness is None else needed + half_width(softness, dtype)
 
 
 def check_size(name: str, size: Any, least: int = 1) -> int:
@@ -103,11 +136,11 @@ def common_dtype(shadow_map: Array, receivers: Receivers) -> jnp.dtype:
 def pad_map(
     shadow_map: Float[Array, "rows columns"], size: int, dtype: Any
 ) -> Float[Array, "texels_down texels_across"]:
-    """The map with `size` texels that are infinitely far all around; NaN is infinitely far.
+    """The map with `size` texels that are infinitely far all around, as what is missing is.
 
     A few more on the right are there to be read, not compared, by vector units.
     """
-    known = jnp.where(jnp.isnan(shadow_map), jnp.inf, shadow_map).astype(dtype)
+    known = jnp.where(shadow_map > 0, shadow_map, jnp.inf).astype(dtype)
     widths = ((size, size), (size, size + LANES - 1))
     return jnp.pad(known, widths, constant_values=jnp.inf)
 
@@ -122,8 +155,11 @@ def find_places(
 ) -> Places:
     """The receivers in a map of `shape` that `pad_map` padded for filters of `size`."""
     u, v, z, slope = (field.astype(dtype) for field in receivers)
+    # One slope that is no number would make the derivative in the slope bias none.
+    known = (z > 0) & jnp.isfinite(slope)
+    slope = jnp.where(known, slope, 0)
     threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
-    threshold = jnp.where((z > 0) & (threshold < jnp.inf), threshold, -jnp.inf)
+    threshold = jnp.where(known & (threshold < jnp.inf), threshold, -jnp.inf)
 
     # A NaN is on neither side of anything, and goes outside of the map.
     reach = size // 2

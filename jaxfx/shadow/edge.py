@@ -39,29 +39,29 @@ def edge_pcf(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
     kernel: Kernel = "box",
-    mask: Mask = "screen",
+    mask: Mask = "depth",
     dilation: WholeNumber | None = None,
 ) -> Float[Array, "height width"]:
     """Percentage-closer filtering near the edges of shadows alone: O(I + B * size**2).
 
-    With `mask="screen"` the edges of the hard shadow are found in the picture and dilated;
-    what they enclose is filtered, the rest is the hard shadow. Shadows that fall between
-    pixels have no edge and are lost.
+    With `mask="depth"`, the default, a pixel is filtered where the smallest and the largest of
+    its texels, a running minimum and maximum of the map, are not both lit or both shadowed.
+    Nothing is lost: the result is `pcf`'s, to the last bit with the box and no softness.
 
-    With `mask="depth"` a pixel is filtered where the smallest and the largest of its texels,
-    a running minimum and maximum of the map, are not both lit or both shadowed. Nothing is
-    lost: the result is `pcf`'s, to the last bit with the box and no softness.
+    With `mask="screen"`, the paper's, the edges of the hard shadow are found in the image and
+    dilated; what they enclose is filtered, the rest is the hard shadow. Shadows that fall
+    between pixels have no edge and are lost.
 
     **Arguments:**
 
     - `shadow_map`, `receivers`, `size`, `bias`, `slope_bias`, `softness`, `kernel`: as in
       `pcf`: height width, texels and scene units.
     - `mask`: which pixels are filtered.
-    - `dilation`: static; pixels by which edges reach, for `mask="screen"`. Outside `jit`,
+    - `dilation`: static; pixels by which edges reach, of `mask="screen"` alone. Outside `jit`,
       `grad` and `vmap` it may be left out, and is then as many as the filter covers at three
       of four edge pixels. Where light grazes a surface it covers more, without limit.
 
@@ -69,7 +69,7 @@ def edge_pcf(
     may need the filter; where none does, none is filtered. Batches are done one by one.
 
     **Raises:** `ValueError` as `pcf` does, for an unknown mask, a dilation that is not 1 or
-    more, or none with `mask="screen"` under a transform.
+    more, one with `mask="depth"`, or none with `mask="screen"` under a transform.
 
     **Gradient:** `pcf`'s in the pixels that are filtered, at the cost of these; zero in the
     others: exact with `mask="depth"`, missing with `"screen"` where that misses. The mask is
@@ -91,10 +91,10 @@ def candidates(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
-    mask: Mask = "screen",
+    mask: Mask = "depth",
     dilation: WholeNumber | None = None,
 ) -> Candidates:
     """The pixels that `edge_pcf` filters, and the number of comparisons that it makes.
@@ -124,6 +124,11 @@ def _reach(name: str, mask: Any, dilation: Any, size: int, data: Any) -> int:
     """The dilation, checked; found if it is left out; 0 where there is none."""
     option(f"{name}(mask=...)", mask, get_args(Mask))
     if mask == "depth":
+        if dilation is not None:
+            raise ValueError(
+                f'`{name}(dilation=...)` must be left out with `mask="depth"`, which needs '
+                f'none: `mask="screen"` dilates, got {dilation!r}.'
+            )
         return 0
     if dilation is None:
         if not is_concrete(data):

@@ -25,14 +25,14 @@ def hard(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
     *,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
     """Visibility by the comparison alone: 0 or 1, with aliased edges.
 
     A receiver is in shadow where the texel that holds it is nearer to the light than
     `z - bias - slope_bias * slope`, and lit otherwise: at equality, outside the map, behind
-    the light, and where the texel is inf or not a number.
+    the light, and where the texel is inf or missing (0, negative, NaN).
 
     **Arguments:**
 
@@ -41,7 +41,9 @@ def hard(
     - `receivers`: what `receivers` returned, height width.
     - `bias`: scene units by which a texel must be nearer to shadow.
     - `slope_bias`: pixels of the map by which the same grows where light grazes: so many times
-      the change of depth from one to the next. Half a filter's size keeps a plane lit.
+      the change of depth from one to the next, the receivers' `slope`. Where both are left out,
+      they are what keeps a plane lit and no more: here half a pixel, and what rounding takes.
+      Where one is given, the other is 0.
 
     **Returns:** height width, 0 or 1, in the type of the receivers.
 
@@ -60,8 +62,8 @@ def prefiltered(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
     """Visibility by comparing with the mean depth of `size` x `size` texels: the wrong order.
 
@@ -72,7 +74,8 @@ def prefiltered(
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and texels, as in `hard`.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`, whose defaults serve: the mean
+      of a plane's depths is that of its middle.
 
     **Returns:** height width, 0 or 1, in the type of the receivers.
 
@@ -82,7 +85,8 @@ def prefiltered(
 
     Source: the order of filtering that Reeves, Salesin & Cook 1987, section 3, warn of.
     """
-    data = _taps.checked("prefiltered", shadow_map, receivers, bias, slope_bias, size=size)
+    data = (shadow_map, receivers, bias, slope_bias)
+    data = _taps.checked("prefiltered", *data, size=size, middle=0.5)
     size = int(size)
     return jax.lax.stop_gradient(_prefiltered(*data[:4], size))
 
@@ -105,8 +109,8 @@ def pcf(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
     kernel: Kernel = "box",
 ) -> Float[Array, "height width"]:
@@ -119,7 +123,9 @@ def pcf(
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and texels, as in `hard`.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, half
+      of `size` texels of slope, half of `softness` and what rounding takes: a plane is lit, and
+      a shadow loses its foot, no wider than the filter, where an occluder touches it.
     - `softness`: scene units; the comparison goes from 0 to 1 by a smoothstep this wide, half
       on each side of the bias. Left out, it is a step, to which it tends.
     - `kernel`: the weights: `"box"`, all the same, wherever in its texel the receiver is; or

@@ -24,8 +24,8 @@ def pcss(
     *,
     size: WholeNumber,
     light_size: Float[ArrayLike, ""] | float,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
     """Soft shadows of a light with an extent: narrow where a thing stands, wide far from it.
@@ -43,7 +43,7 @@ def pcss(
     - `size`: static; odd, in texels.
     - `light_size`: the light's diameter, in scene units before a pinhole camera, in radians,
       as seen from the scene, before an orthographic one.
-    - `bias`, `slope_bias`, `softness`: scene units and pixels, as in `pcf`.
+    - `bias`, `slope_bias`, `softness`: scene units and texels, as in `pcf`.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
 
@@ -82,7 +82,7 @@ def _pcss(shadow_map, receivers, camera, bias, slope_bias, softness, light_size,
 
     count, total = _taps.sum_rows(blockers, size)
     mean = safe_divide(total, count)
-    z = receivers.z.astype(dtype)
+    z = jnp.where(places.threshold > -jnp.inf, receivers.z.astype(dtype), 1)
     width = _penumbra(camera, light_size.astype(dtype), z, mean)
     width = jnp.where((count > 0) & (mean > 0), width, 0)
     half = jnp.clip(width / 2, 0.5, max(size // 2, 0.5))

@@ -14,6 +14,7 @@ from jaxfx._checks import check, check_map, items, parameter
 from jaxfx._numerics import absolute, normalize, safe_divide, safe_sqrt, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
+from jaxfx.camera._rigid import at_origin, per_depth
 
 
 _Image = Float[Array, "height width"]
@@ -102,7 +103,11 @@ def _receivers(depth, camera, cameras, normal, offset) -> Receivers:
     shown = (depth > 0) & jnp.isfinite(depth)
     safe = jnp.where(shown, depth, 1).astype(dtype)
     points = camera.unproject(pixel_centers(height, width, dtype), safe)
-    normal = _normal(points, safe, shown) if normal is None else normal.astype(dtype)
+    if normal is None:
+        normal = _normal(points, safe, shown)
+    else:
+        # Where nothing is shown it may be no number, and a derivative multiplies it by 0.
+        normal = jnp.where(shown[..., None], normal, 0).astype(dtype)
     points = points + offset.astype(dtype) * normal
 
     first, *others = (_seen(points, normal, shown, each) for each in cameras)
@@ -137,11 +142,11 @@ def _seen(
 
 def _axes(camera: Camera, pixels: Float[Array, "height width 2"], z: _Image):
     """How a world point moves with its u, v and z: exact, for it is linear in each."""
-    zero = jnp.zeros_like(pixels)
+    camera, zero = at_origin(camera), jnp.zeros_like(pixels)
     right, down = (zero.at[..., axis].set(1) for axis in (0, 1))
     start = camera.unproject(zero, z)
-    ray = camera.unproject(pixels, jnp.ones_like(z)) - camera.unproject(pixels, z * 0)
-    return camera.unproject(right, z) - start, camera.unproject(down, z) - start, ray
+    sides = camera.unproject(right, z) - start, camera.unproject(down, z) - start
+    return *sides, per_depth(camera, pixels)
 
 
 def _dot(one: _Vectors, other: _Vectors) -> _Image:
@@ -150,8 +155,9 @@ def _dot(one: _Vectors, other: _Vectors) -> _Image:
 
 def _normal(points: _Vectors, depth: _Image, shown: Bool[Array, "height width"]) -> _Vectors:
     """Unit normals, towards the camera, of the surface through neighbouring pixels."""
-    along_x = _step(points, depth, shown, axis=1)
-    along_y = _step(points, depth, shown, axis=0)
+    # As unit vectors, for a product of small steps, or of large ones, leaves float32's range.
+    along_x = normalize(_step(points, depth, shown, axis=1))
+    along_y = normalize(_step(points, depth, shown, axis=0))
     # Rows go down and columns right, so that this points at the camera.
     return normalize(jnp.cross(along_y, along_x))
 

@@ -20,8 +20,8 @@ def variance(
     receivers: Receivers,
     *,
     size: WholeNumber,
-    bias: Float[ArrayLike, ""] | float = 0.0,
-    slope_bias: Float[ArrayLike, ""] | float = 0.0,
+    bias: Float[ArrayLike, ""] | float | None = None,
+    slope_bias: Float[ArrayLike, ""] | float | None = None,
     min_variance: Float[ArrayLike, ""] | float = 0.0,
 ) -> Float[Array, "height width"]:
     """Visibility by an upper bound from the mean and the variance of the filtered depths.
@@ -34,10 +34,11 @@ def variance(
 
     **Arguments:**
 
-    - `shadow_map`, `receivers`: height width, as in `hard`. An inf counts as the farthest depth
-      of map and receivers.
+    - `shadow_map`, `receivers`: height width, as in `hard`. An inf, or what is missing, counts
+      as the farthest depth of map and receivers.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and pixels, as in `hard`.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, what
+      rounding takes: a plane's mean depth, read between texels, is the plane's.
     - `min_variance`: scene units squared; the variance is at least this.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
@@ -49,7 +50,8 @@ def variance(
 
     Source: Donnelly & Lauritzen 2006, variance shadow maps, equations 4 and 5.
     """
-    data = _taps.checked("variance", shadow_map, receivers, bias, slope_bias, size=size)
+    data = (shadow_map, receivers, bias, slope_bias)
+    data = _taps.checked("variance", *data, size=size, middle=0.0)
     least = parameter("variance(min_variance=...)", min_variance)
     check(
         "variance(min_variance=...)", least, lambda v: (v >= 0) & (v < np.inf), "0 or positive"
@@ -61,14 +63,18 @@ def variance(
 def _variance(shadow_map, receivers, bias, slope_bias, least, size):
     dtype = _taps.common_dtype(shadow_map, receivers)
     z = receivers.z.astype(dtype)
-    threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * receivers.slope)
+    slope = receivers.slope.astype(dtype)
     points = jnp.stack([receivers.u, receivers.v], axis=-1).astype(dtype)
-    known = jnp.isfinite(points).all(axis=-1) & jnp.isfinite(threshold) & (z > 0)
+    known = jnp.isfinite(points).all(axis=-1) & jnp.isfinite(z) & jnp.isfinite(slope) & (z > 0)
+    z, slope = (jnp.where(known, each, 0) for each in (z, slope))
+    threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
+    known &= jnp.isfinite(threshold)
     threshold = jnp.where(known, threshold, 0)
 
-    near, far = _range(shadow_map.astype(dtype), threshold, known)
+    shadow_map = jnp.where(shadow_map > 0, shadow_map.astype(dtype), jnp.inf)
+    near, far = _range(shadow_map, threshold, known)
     scale = jnp.where(far > near, far - near, 1)
-    depth = jnp.where(jnp.isfinite(shadow_map), shadow_map.astype(dtype), far)
+    depth = jnp.where(shadow_map < jnp.inf, shadow_map, far)
     depth = jnp.pad((depth - near) / scale, size + 1, constant_values=(far - near) / scale)
     moments = _mean(jnp.stack([depth, depth * depth], axis=-1), size)
 

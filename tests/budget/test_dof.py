@@ -55,7 +55,7 @@ def test_no_plan_exceeds_its_error(plans):
 
 
 def test_the_error_allowed_is_made_use_of(plans):
-    plans.are_made_use_of(60)
+    plans.are_made_use_of(0.3)
 
 
 def test_plans_differ_with_scenes_and_say_why(plans):

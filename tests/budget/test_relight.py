@@ -55,7 +55,7 @@ def test_no_plan_exceeds_its_error(plans):
 
 
 def test_the_error_allowed_is_made_use_of(plans):
-    plans.are_made_use_of(120)
+    plans.are_made_use_of(0.6)
 
 
 def test_a_plan_names_the_lights_that_it_drops():

@@ -43,7 +43,7 @@ def test_no_plan_exceeds_its_error(plans):
 
 
 def test_the_error_allowed_is_made_use_of(plans):
-    plans.are_made_use_of(60)
+    plans.are_made_use_of(0.3)
 
 
 def test_some_plans_leave_a_source_out_and_some_a_few_tiles_of_it(plans):

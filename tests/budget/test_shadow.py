@@ -36,7 +36,7 @@ def test_no_plan_exceeds_its_error(plans):
 
 
 def test_the_error_allowed_is_made_use_of(plans):
-    plans.are_made_use_of(20)
+    plans.are_made_use_of(0.1)
 
 
 def test_plans_differ_with_scenes_and_say_why(plans):

@@ -118,6 +118,26 @@ def test_jitter_antialiases_by_a_box_of_one_pixel():
     assert set(np.unique(accumulate(shifted, samples=8, jitter=False).image)) == {0, 1}
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_one_bad_pixel_spoils_neither_the_convergence_nor_a_derivative(bad):
+    good = plane(3.0, waves)
+    clear = np.ones((HEIGHT, WIDTH, 1), bool)
+    clear[2, 5] = False
+    spoiled = lambda camera: jnp.where(clear, good(camera), bad)
+    whole, without = accumulate(spoiled, samples=4), accumulate(good, samples=4)
+    np.testing.assert_array_equal(np.isfinite(whole.image), clear)
+    half = accumulate(good, samples=2).image
+    expected = np.sqrt(np.mean(np.asarray(half - without.image)[clear] ** 2))
+    np.testing.assert_allclose(whole.convergence, expected, rtol=1e-9)
+
+    def convergence(lens):
+        return accumulate(spoiled, lens, samples=4).convergence
+
+    assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(jax.grad(convergence)(LENS)))
+    nowhere = accumulate(lambda camera: 0 * good(camera) + np.nan, samples=4)
+    assert np.isnan(nowhere.convergence)
+
+
 def test_convergence_is_that_of_half_the_passes_and_tells_the_error():
     render = plane(5.0, waves)
     truth = blurred_waves(5.0)

@@ -106,6 +106,7 @@ def test_nothing_flows_into_focus_or_past_a_bad_pixel(method):
         np.testing.assert_array_equal(wrong, [[4, 3]])
 
 
+@pytest.mark.usefixtures("optimised")
 def test_implicit_work_does_not_grow_with_the_radius():
     def operations(max_coc):
         call = jax.jit(lambda *a: dof.implicit_diffusion(*a, LENSES[0], max_coc=max_coc))
@@ -129,6 +130,7 @@ def test_implicit_keeps_its_digits_at_any_radius():
     np.testing.assert_allclose(call(image), exact, rtol=2e-5)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_explicit_memory_of_a_gradient_grows_with_the_root_of_the_steps():
     image, depth = scene(0, 32, 32)
 

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx import FocusPlanes, ThinLens, dof, metrics, relight, scene
 from jaxfx.scene import _embree, _opengl
+from tests.helpers.quick import quick_jit
 
 
 # A lens for which the depths 1, 2 and inf are of defocus -12, 0 and 12 pixels.

@@ -6,10 +6,10 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from quick import quick_jit
 
 from jaxfx.dof import _sheets
 from jaxfx.dof._slices import Sheets
+from tests.helpers.quick import quick_jit
 
 
 @functools.cache

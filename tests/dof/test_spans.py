@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from quick import quick_jit
 
 from jaxfx import ThinLens, dof
 from jaxfx.dof._paint import BLOCK
@@ -18,6 +17,7 @@ from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import Sprites
 from jaxfx.dof._tiles import tiles
+from tests.helpers.quick import quick_jit
 
 
 REACH = 21
@@ -103,6 +103,7 @@ def test_the_order_of_pixels_is_irrelevant(kernel):
     np.testing.assert_allclose(sum(parts), compiled(kernel)(given), atol=1e-12)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize(("kernel", "reach"), [("shift", 8), ("tiles", 8), ("spans", 64)])
 def test_a_gradient_takes_at_most_24_pictures_of_memory(kernel, reach):
     shape = jax.ShapeDtypeStruct((512, 512, 3), jnp.float32)

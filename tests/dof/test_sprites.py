@@ -1,10 +1,13 @@
 """The sprite of a pixel: its rows' area, and what it covers in all."""
 
+import functools as ft
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfx import ThinLens, dof
 from jaxfx.dof._sprites import coverage, row_half_width, segment_integral
 
 
@@ -38,3 +41,24 @@ def test_what_a_disc_covers_is_as_much_as_in_counted_points(radius):
     # A row is one rectangle as wide as its area: equal in all, not pixel by pixel.
     counted = inside.mean(axis=(1, 3)).sum(axis=1)
     np.testing.assert_allclose(np.asarray(cover).sum(axis=1), counted, atol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["scatter", "layered", "depth_sorted"])
+@pytest.mark.parametrize(("aperture", "is_moving"), [(0.004, False), (0.1, True), (3.0, False)])
+def test_a_circle_below_a_pixel_or_above_max_coc_moves_nothing(name, aperture, is_moving):
+    """Circles of 0.1 pixels at the most, of 0.6 to 3, and of 17 at the least."""
+    rng = np.random.default_rng(0)
+    image, depth = jnp.asarray(rng.random((9, 10, 2))), jnp.asarray(rng.uniform(2, 4, (9, 10)))
+    method = ft.partial(getattr(dof, name), max_coc=8.0)
+    lens = ThinLens(aperture, 1.8, 100.0)
+    circles = lens.circle_of_confusion(depth)
+    assert bool(((circles > 1) & (circles < 8)).any()) == is_moving
+
+    @jax.jit
+    def loss(lens, depth):
+        return jnp.sum(method(image, depth, lens) ** 2)
+
+    slopes = jax.tree.leaves(jax.grad(loss, argnums=(0, 1))(lens, depth))
+    # Of `layered` rounding is left.
+    largest = max(float(abs(slope).max()) for slope in slopes)
+    assert largest > 1e-3 if is_moving else largest < 1e-11

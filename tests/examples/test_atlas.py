@@ -1,6 +1,5 @@
 """The atlas, run as a user runs it, of one effect at a tiny size."""
 
-import importlib
 import inspect
 import math
 import subprocess
@@ -13,10 +12,11 @@ import pytest
 import scipy.ndimage
 from PIL import Image
 
+from benchmarks import atlas
 from jaxfx import blur, dof, relight, reproject, shadow
 
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+ROOT = Path(__file__).parents[2]
 CHARTS = {
     *(
         f"blur_{cost}_{scene}"
@@ -28,27 +28,18 @@ CHARTS = {
 
 
 @pytest.fixture(scope="module")
-def atlas():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(EXAMPLES))
-        yield importlib.import_module("atlas")
-    for name in ("atlas", "atlas_cases"):
-        del sys.modules[name]
-
-
-@pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas") / "made" / "anew"
     options = ["--effects", "blur", "--size", "32", "--quick", "--out", str(folder)]
-    command = [sys.executable, str(EXAMPLES / "atlas.py"), *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "benchmarks.atlas", *options]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "28 measurements, 6 charts in " in done.stdout
     return folder
 
 
 @pytest.fixture(scope="module")
-def rows(atlas, out):
+def rows(out):
     return atlas.read_rows(out / "atlas.csv")
 
 
@@ -57,7 +48,7 @@ def test_it_writes_figures_machine_and_every_chart_twice(out):
     assert {path.name for path in out.iterdir()} == files | {"atlas.csv", "atlas.txt"}
 
 
-def test_rows_are_complete_and_agree_with_themselves(atlas, rows):
+def test_rows_are_complete_and_agree_with_themselves(rows):
     case = atlas.atlas_cases.blurred(atlas.Point("spikes", 32, 4))
     settings = {(m, s) for m, each in case.methods.items() for s in each}
     usual = {(method, next(iter(each))) for method, each in case.methods.items()}
@@ -75,7 +66,7 @@ def test_rows_are_complete_and_agree_with_themselves(atlas, rows):
     assert len(rows) == sum(map(len, map(set, found.values())))
 
 
-def test_an_error_is_what_scipy_makes_it(atlas, rows):
+def test_an_error_is_what_scipy_makes_it(rows):
     """A Gaussian cut at 2 sigma against one cut at 8, both SciPy's."""
     case = atlas.atlas_cases.blurred(atlas.Point("spikes", 32, 4))
     (image,) = case.data
@@ -99,7 +90,7 @@ def test_an_error_is_what_scipy_makes_it(atlas, rows):
 
 
 @pytest.mark.parametrize("name", sorted(CHARTS))
-def test_a_chart_says_what_it_shows(atlas, out, rows, name):
+def test_a_chart_says_what_it_shows(out, rows, name):
     svg = xml.etree.ElementTree.parse(out / f"{name}.svg")
     words = [
         "".join(element.itertext()).strip()
@@ -119,7 +110,7 @@ def test_a_chart_says_what_it_shows(atlas, out, rows, name):
         assert np.asarray(picture.convert("L")).std() > 10
 
 
-def test_rows_survive_the_file(atlas, rows, tmp_path):
+def test_rows_survive_the_file(rows, tmp_path):
     unknown = rows[0]._replace(memory_bytes=math.nan, psnr=math.inf, rmse=0.0)
     atlas.write_rows([unknown, *rows], tmp_path / "atlas.csv")
     first, *others = atlas.read_rows(tmp_path / "atlas.csv")
@@ -128,7 +119,7 @@ def test_rows_survive_the_file(atlas, rows, tmp_path):
     assert first[:7] == unknown[:7]
 
 
-def test_an_earlier_run_is_drawn_again(atlas, out, tmp_path, monkeypatch, capsys):
+def test_an_earlier_run_is_drawn_again(out, tmp_path, monkeypatch, capsys):
     drawn = []
     monkeypatch.setattr(
         atlas, "charts", lambda rows, key, *_: drawn.append((key, len(rows))) or {}
@@ -149,7 +140,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("effect", [dof, blur, reproject, shadow, relight])
-def test_every_method_of_an_effect_is_measured(atlas, effect):
+def test_every_method_of_an_effect_is_measured(effect):
     source = inspect.getsource(atlas.atlas_cases)
     effect_name = effect.__name__.split(".")[1]
     for name in set(effect.__all__) - PARTS:
@@ -163,7 +154,7 @@ def test_every_method_of_an_effect_is_measured(atlas, effect):
         (["--effects", "glow"], "invalid choice: 'glow'"),
     ],
 )
-def test_an_option_out_of_range_is_refused(atlas, monkeypatch, capsys, options, message):
+def test_an_option_out_of_range_is_refused(monkeypatch, capsys, options, message):
     monkeypatch.setattr(sys, "argv", ["atlas.py", *options])
     with pytest.raises(SystemExit):
         atlas.main()
@@ -178,9 +169,7 @@ def test_an_option_out_of_range_is_refused(atlas, monkeypatch, capsys, options, 
         (["--csv", "file"], "atlas.py: error: --csv must be a file that this command wrote"),
     ],
 )
-def test_what_can_not_be_read_or_written_is_one_line(
-    atlas, tmp_path, monkeypatch, options, message
-):
+def test_what_can_not_be_read_or_written_is_one_line(tmp_path, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("a,b\n1,2\n")
     monkeypatch.setattr(sys, "argv", ["atlas.py", *options])

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -41,12 +42,11 @@ def photograph(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def example(monkeypatch):
+def example():
     spec = importlib.util.spec_from_file_location("refocus", SCRIPT)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    yield module
-    module.plt.close("all")
+    return module
 
 
 @pytest.fixture
@@ -87,24 +87,11 @@ def test_what_is_in_focus_is_sharp_and_the_rest_is_not(photograph, main):
     np.testing.assert_allclose(shown, near[""].clip(0, 1), atol=0.01)
 
 
-def test_what_is_missing_is_filled_with_the_farther_end(photograph, main):
-    main("color.png", "depth.png", "--focus", FAR, "--method", "scatter")
+@pytest.mark.parametrize("fill", ["guided", "rows"])
+def test_what_is_missing_is_filled_with_what_is_behind(photograph, main, fill):
+    main("color.png", "depth.png", "--focus", FAR, "--method", "scatter", "--fill", fill)
     depth = exr.read("out/focus_2.exr")["depth"]
     np.testing.assert_allclose(depth, np.where(is_card(), NEAR, FAR), rtol=1e-6)
-
-
-def test_the_rule_for_holes(example):
-    nan = np.nan
-    depth = np.array(
-        [
-            [nan, 3, nan, nan, 5, nan],
-            [nan, nan, nan, nan, nan, nan],
-            [1, nan, 2, nan, 1, 7],
-        ],
-        np.float32,
-    )
-    expected = [[3, 3, 5, 5, 5, 5], [3, 3, 5, 5, 5, 7], [1, 2, 2, 2, 1, 7]]
-    np.testing.assert_array_equal(example.filled(depth), expected)
 
 
 def test_depth_of_an_exr_is_in_scene_units_and_the_lens_has_defaults(photograph, main):
@@ -127,11 +114,20 @@ def test_a_scale_may_be_a_fraction(photograph, main):
     ("arguments", "message"),
     [
         (("missing.png", "depth.png"), "No such file"),
-        (("color.png", "color.png"), "must have one channel of depth"),
-        (("color.png", "broken.png"), "`broken.png` is damaged or not PNG"),
+        (("color.png", "color.png"), "`color.png` must be of grey, 8 or 16 bits"),
+        (("color.png", "broken.png"), "`broken.png` must be a PNG, EXR, PFM, NPY or NPZ file"),
+        (("color.png",), "`color.png` must be an OpenEXR file"),
+        (("depth.exr",), "`depth.exr` must have one layer with an image and a depth"),
+        (("color.png", "depth.png", "--disparity"), "must have --disparity-scale, or --base"),
+        (("color.png", "depth.png", "--disparity", "--baseline", "1"), "and --focal of a pair"),
+        (("color.png", "depth.png", "--behind", "x"), "must be an OpenEXR file"),
+        (
+            ("color.png", "depth.png", "--behind", "x", "--method", "scatter"),
+            "--behind must have --method layered",
+        ),
         (("color.png", "small.png"), r"one height and width, got \(30, 40\) and \(5, 5\)"),
         (("color.png", "empty.png"), "must be known somewhere"),
-        (("color.png", "depth.png", "--focus", "40,3"), "must lie in the 40 x 30 picture"),
+        (("color.png", "depth.png", "--focus", "40,3"), "must lie in the 40 x 30 image"),
         (("color.png", "depth.png", "--out", "color.png"), "must be a folder to write to"),
     ],
 )
@@ -146,6 +142,104 @@ def test_a_fault_is_one_line_and_nothing_is_written(photograph, main, arguments,
     assert not list(Path().glob("out/*"))
 
 
+def wall():
+    return np.where(is_card(), NEAR, FAR)
+
+
+def depth_in_use(main, *arguments):
+    main(*arguments, "--focus", FAR, "--method", "scatter")
+    return exr.read("out/focus_2.exr")["depth"]
+
+
+def write_pfm(path, values):
+    Path(path).write_bytes(b"Pf\n40 30\n-1.0\n" + values[::-1].astype("<f4").tobytes())
+
+
+def test_depth_of_any_file(photograph, main):
+    """Each says the same depth, in its own way."""
+    np.save("metres.npy", wall().astype(np.float16))
+    np.save("steps.npy", (1000 * wall()).astype(np.int32))
+    write_pfm("metres.pfm", wall())
+    for name in ("metres.npy", "steps.npy", "metres.pfm", "depth.exr", "depth.png"):
+        np.testing.assert_allclose(depth_in_use(main, "color.png", name), wall(), rtol=1e-6)
+
+
+def test_disparity(photograph, main):
+    """Of a network, up to scale and shift; of a pair in pixels, or in steps of 1 / 256."""
+    np.save("relative.npy", (1 / wall() - 0.25) / 0.05)
+    options = ("--disparity", "--disparity-scale", 0.05, "--disparity-shift", "1/4")
+    found = depth_in_use(main, "color.png", "relative.npy", *options)
+    np.testing.assert_allclose(found, wall(), rtol=1e-6)
+
+    pixels = 60 * 0.5 / wall() - 3
+    pixels[10:20, 8:12] = np.inf  # no match
+    write_pfm("pair.pfm", pixels)
+    Image.fromarray(np.where(np.isinf(pixels), 0, 256 * pixels).astype(np.uint16)).save(
+        "pair.png"
+    )
+    options = ("--disparity", "--baseline", 0.5, "--offset", 3, "--focal", 60)
+    for name, more in (("pair.pfm", ()), ("pair.png", ("--depth-scale", "1/256"))):
+        found = depth_in_use(main, "color.png", name, *options, *more)
+        np.testing.assert_allclose(found, wall(), rtol=1e-6)
+
+
+def test_ray_distance(photograph, main):
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    distance = wall() * np.sqrt(1 + ((x - 20) ** 2 + (y - 15) ** 2) / 30**2)
+    np.save("distance.npy", distance)
+    found = depth_in_use(main, "color.png", "distance.npy", "--ray", "--focal", 30)
+    np.testing.assert_allclose(found, wall(), rtol=1e-6)
+
+
+def multilayer(path):
+    """As Blender writes it, in half floats: a card before a sky, and the sky alone behind."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    pattern = np.where((x + y) % 2, 0.9, 0.1)
+    planes = {}
+    for layer, depth in (("Front", np.where(is_card(), NEAR, 65504)), ("Back", 65504 + 0 * x)):
+        for letter in "RGBA":
+            planes[f"{layer}.Combined.{letter}"] = pattern.astype(np.float16)
+        planes[f"{layer}.Depth.Z"] = depth.astype(np.float16)
+        planes[f"{layer}.AO.V"] = pattern.astype(np.float16)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, planes).write(path)
+
+
+@pytest.mark.parametrize("behind", [(), ("--behind", "Back")])
+def test_one_file_of_blender(photograph, main, behind):
+    multilayer("render.exr")
+    main("render.exr", "--layer", "Front", *behind, "--focus", NEAR, "--aperture", 0.1)
+    found = exr.read("out/focus_1.exr")
+    np.testing.assert_array_equal(found["depth"], np.where(is_card(), NEAR, np.inf))
+    assert found[""].shape == (HEIGHT, WIDTH, 3)
+    assert np.isfinite(found[""]).all()
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    inside = (abs(y - 15) < 4) & (abs(x - 20) < 6)
+    assert contrast(found[""], inside) == pytest.approx(0.8, abs=0.01)
+
+
+def test_a_photograph_in_jpeg(photograph, main):
+    """Whatever its name ends in."""
+    smooth = np.broadcast_to(np.linspace(40, 200, WIDTH)[None, :, None], (HEIGHT, WIDTH, 3))
+    Image.fromarray(smooth.astype(np.uint8)).save("photo.png", "JPEG", quality=100)
+    main("photo.png", "depth.exr", "--focus", FAR, "--aperture", 1e-6)
+    image = exr.read("out/focus_2.exr")[""]
+    np.testing.assert_allclose(image, io.linear_from_srgb(smooth / 255), atol=0.02)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_no_place_of_the_figure_is_blank(photograph, main, count):
+    main("color.png", "depth.exr", "--method", "scatter", "--focus", *np.linspace(1, 2, count))
+    with Image.open("out/refocus.png") as figure:
+        shown = np.asarray(figure.convert("RGB"))
+    is_white = (shown == 255).all(axis=2)
+    # Neither at the foot nor at the right is there more than a narrow margin.
+    rows, columns = (np.flatnonzero(~is_white.all(axis=axis)) for axis in (1, 0))
+    assert rows.max() > 0.85 * shown.shape[0]
+    assert columns.max() > 0.9 * shown.shape[1]
+    assert is_white.mean() < 0.5
+
+
 @pytest.mark.parametrize("option", ["--focus", "--aperture", "--depth-scale", "--focal"])
 def test_a_number_that_is_none_is_refused(main, capsys, option):
     with pytest.raises(SystemExit) as caught:
@@ -158,4 +252,4 @@ def test_as_a_user_runs_it(photograph):
     command = [sys.executable, str(SCRIPT), "color.png", "depth.png", "--method", "scatter"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout == "pictures in out\n"
+    assert done.stdout == "images in out\n"

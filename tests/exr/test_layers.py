@@ -180,6 +180,12 @@ def test_errors_of_write(tmp_path, channels, message):
     assert not list(tmp_path.iterdir())
 
 
+def test_other_suffixes_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"`write\(path\)` must end in `.exr`.*a.png`"):
+        exr.write(tmp_path / "a.png", IMAGE)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_longest_name(tmp_path):
     exr.write(tmp_path / "a.exr", {"a" * 253: IMAGE})
     assert_same(exr.read(tmp_path / "a.exr"), {"a" * 253: IMAGE})

@@ -71,13 +71,48 @@ def test_a_rendered_views_pose_is_recovered(seed):
     assert jnp.allclose(found.camera.intrinsics, start.intrinsics)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("hole", [0.0, -1.0, np.nan, np.inf])
+def test_one_hole_in_the_depth_has_no_say(hole, dtype):
+    y, x = np.mgrid[:32, :32] / 32
+    image = np.stack([np.sin(9 * x + 3 * y), np.cos(7 * y), np.sin(5 * x * y)], -1) / 2 + 0.5
+    eye = PinholeCamera.from_fov(1.0, height=32, width=32)
+    depth = np.full((32, 32), 2, dtype)
+    depth[10, 20] = hole
+    pictures = [image.astype(dtype)] * 2
+    found = fit.camera(*pictures, depth, eye, eye, throw=False, progress=False)
+    assert found.success and float(found.losses[0]) < 1e-12
+    # All but those that look within two texels of the hole, and those beside.
+    assert float(found.share) == pytest.approx(1 - 49 / 32**2)
+    assert np.isfinite(found.uncertainty).all()
+    np.testing.assert_allclose(found.camera.world_from_camera, eye.world_from_camera, atol=1e-5)
+
+
+def test_a_pose_is_recovered_from_a_depth_with_holes():
+    """As a depth camera leaves them: blobs, and a strip beside each step."""
+    reference, image, depth, source, true = pictures()
+    depth, rng = np.array(depth), np.random.default_rng(0)
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    lost = np.zeros(depth.shape, bool)
+    for _ in range(6):
+        cx, cy = rng.uniform(0, SIDE, 2)
+        lost |= (x - cx) ** 2 + (y - cy) ** 2 < 16
+    step = np.abs(np.diff(depth, axis=1, append=depth[:, -1:])) > 0.1 * depth
+    lost |= step | np.roll(step, 1, axis=1)
+    depth[lost] = rng.choice([0, -1, np.nan], lost.sum())
+    start = moved(true, (1, 0.3, 0.2), 2.0, (0.03, 0.02, -0.03))
+    found = fit.camera(reference, image, depth, source, start, progress=False)
+    angle, distance = apart(found.camera, true)
+    assert found.success and angle < 0.1 and np.linalg.norm(distance) < 0.01
+
+
 def test_failure_is_said():
     reference, image, depth, source, true = pictures()
     away = moved(true, (0, 1, 0), 180.0, (0, 0, 0))
     with pytest.raises(RuntimeError, match=r"found no pose .* over 0 % of the"):
         fit.camera(reference, image, depth, source, away, progress=False)
     lost = fit.camera(reference, image, depth, source, away, throw=False, progress=False)
-    assert lost.share == 0 and jnp.isinf(lost.uncertainty).all()
+    assert lost.share == 0 and jnp.isinf(lost.uncertainty).all() and not lost.success
 
 
 FAULTS = {

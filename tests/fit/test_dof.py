@@ -106,6 +106,17 @@ def test_the_threshold_of_layered_scatter_is_found():
     assert set(fitted.uncertainty) == set(fit.LAYERED_PARAMETERS)
 
 
+@pytest.mark.usefixtures("quick")
+def test_a_lens_that_no_derivative_moves_may_be_held():
+    """Below a pixel it can't be found, but what else there is can be."""
+    image, depth = still_life(16)
+    lens = ThinLens(1e-3, 3.0, 120.0)
+    how = {"parameters": ("gamma",), "max_coc": 2.0, "throw": False}
+    held = fit.dof(0.9 * image, image, depth, lens, **how)
+    assert held.lens.aperture == lens.aperture
+    assert held.uncertainty["gamma"] > 1e6
+
+
 def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
     reference, image, depth = picture()
     start = dof.scatter(image, depth, **options(wrong((1, 1, 1, 1))))
@@ -173,6 +184,7 @@ def test_failure_is_said():
         quietly(*picture(), start, max_steps=3)
     fitted = quietly(*picture(), start, max_steps=3, throw=False)
     assert not fitted.success
+    assert "maximum number of steps" in str(fitted.result) and "maximum" in repr(fitted)
     assert fitted.result == optx.RESULTS.nonlinear_max_steps_reached
     assert np.isfinite(fitted.losses).all()
 
@@ -231,6 +243,8 @@ FAULTS = {
     "dof(depth) must be positive": {"depth": np.zeros((SIZE, SIZE))},
     "dof(lens)": {"lens": FocusPlanes(1.0, 2.0, 3.0, 4.0)},
     "dof(lens.aperture)": {"lens": ThinLens(0.0, 3.0, 120.0)},
+    "dof(lens) must start with a circle": {"lens": ThinLens(1e-3, 3.0, 120.0)},
+    "dof(lens) must start": {"lens": ThinLens(5.0, 0.1, 120.0), "max_coc": 2.0},
     "dof(gamma=...)": {"gamma": -1.0},
     "dof(epsilon=...)": {"epsilon": np.zeros(2)},
     "dof(parameters=...)": {"parameters": ("aperture", "focal_pixels")},

@@ -4,12 +4,13 @@ import functools
 import inspect
 import re
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from shadow_scenes import Boxes
 
+from benchmarks.scenes.shadow import Boxes
 from jaxfx import (
     AmbientLight,
     DirectionalLight,
@@ -150,6 +151,7 @@ def test_failure_is_said():
     fitted = quietly(picture(), cache(), WRONG[0], max_steps=2, throw=False)
     assert not fitted.success
     assert fitted.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert "maximum number of steps" in str(fitted.result)
     assert len(fitted.losses) == 3 and np.isfinite(fitted.losses).all()
 
 
@@ -246,6 +248,42 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
         )
     spread = np.std(misses, axis=0)
     assert ((spread > 0.7) & (spread < 1.3)).all(), spread
+
+
+@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan])
+def test_a_pixel_whose_depth_is_missing_has_no_say(missing):
+    gbuffer, lights = cache(), TRUTH[:2]
+    reference = relight.render(gbuffer, CAMERA, lights)
+    lost = np.zeros((SIZE, SIZE), bool)
+    lost[3:9, 12:20] = lost[20, 20] = True
+    holed = eqx.tree_at(lambda g: g.depth, gbuffer, jnp.where(lost, missing, gbuffer.depth))
+    wrong = jnp.where(lost[..., None], 7.0, reference)
+    start = [WRONG[0][0], WRONG[0][1]]
+    found = quietly(wrong, holed, start)
+    assert found.success
+    assert_close(found.lights, lights, 1e-3)
+
+
+# Behind the surface, and turned away from it: neither lights anything.
+AWAY = (PointLight([0.0, 0.0, 50.0], WHITE), SpotLight([0, 0, -1], [0, 0, -1], WHITE, 0.2, 0.3))
+
+
+@pytest.mark.parametrize("light", AWAY, ids=lambda light: type(light).__name__)
+def test_a_start_that_nothing_moves_is_said(light, caplog):
+    """The log names it beside others; alone it is an error."""
+    fitted = quietly(picture(), cache(), (*SUNS, light), throw=False)
+    (message,) = {record.getMessage() for record in caplog.records if record.name == "jaxfx"}
+    assert "can't move" in message and f"position of light {len(SUNS)}" in message
+    np.testing.assert_array_equal(fitted.lights[-1].position, light.position)
+    assert np.isinf(fitted.uncertainty[-1]["position"]).all()
+    with pytest.raises(ValueError, match=r"`lights\(lights\)` must start where.* position of"):
+        quietly(picture(), cache(), (light,), parameters=("position",))
+
+
+def test_a_start_that_moves_says_nothing(caplog):
+    fitted = quietly(picture(), cache(), SUNS, parameters=("color",))
+    assert not caplog.records
+    assert str(fitted.result) == repr(fitted.result) == "The search converged."
 
 
 FAULTS = {

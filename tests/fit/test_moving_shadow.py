@@ -141,6 +141,34 @@ def test_derivatives_against_differences(camera, make, start):
     assert np.abs(reverse).max() > 1
 
 
+@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan])
+def test_what_is_missing_shadows_nothing_and_spoils_no_derivative(missing):
+    """In the map it is as nothing there; in the cache, whose normals then are no numbers."""
+    gbuffer = plane()
+    full, weight = (
+        shadow_map(STRAIGHT, gbuffer),
+        np.random.default_rng(0).normal(size=(SIZE,) * 2),
+    )
+    lost = np.zeros((SIZE, SIZE), bool)
+    lost[20:23, 20:28] = True
+    images = [gbuffer.color, gbuffer.shader, *[gbuffer.color] * 3]
+    found = []
+    for empty, unread in ((np.inf, gbuffer.normal), (missing, np.nan)):
+        normal = jnp.where(lost[..., None], unread, gbuffer.normal)
+        depth = jnp.where(lost, empty, gbuffer.depth)
+        holed = GBuffer(*images, normal, depth, gbuffer.roughness)
+        soft = fit.MovingShadow(
+            jnp.where(lost, empty, full), STRAIGHT, holed, STRAIGHT, softness=0.3
+        )
+        loss = lambda v, soft=soft: jnp.sum(weight * soft(DirectionalLight(v, jnp.ones(3))))
+        at = jnp.array([0.05, -0.1, 1.0])
+        forward = [jax.jvp(loss, (at,), (axis,))[1] for axis in jnp.eye(3)]
+        found.append((soft(sun()), jax.grad(loss)(at), jnp.stack(forward)))
+    for one, other in zip(*found, strict=True):
+        assert np.isfinite(one).all()
+        np.testing.assert_allclose(other, one, atol=1e-9)
+
+
 def test_nothing_shown_and_nothing_known():
     gbuffer = plane()
     empty = np.full((SIZE, SIZE), np.inf)

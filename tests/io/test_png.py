@@ -20,8 +20,17 @@ def paeth(left, up, corner):
     return min((left, up, corner), key=lambda value: abs(guess - value))
 
 
-def png(pixels):
-    """A file of `pixels`, 8 or 16 bits, whose rows take turns with the five filters."""
+def chunk(kind, body):
+    return (
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    )
+
+
+def png(pixels, facts=b""):
+    """A file of `pixels`, 8 or 16 bits, whose rows take turns with the five filters.
+
+    `facts` are chunks between its header and its pixels.
+    """
     height, width, channels = pixels.shape
     step = channels * pixels.dtype.itemsize
     rows = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder(">")).view(np.uint8)
@@ -36,11 +45,8 @@ def png(pixels):
             stream.append((value - guesses[j % 5]) % 256)
     bits = 8 * pixels.dtype.itemsize
     header = struct.pack(">IIBBBBB", width, height, bits, COLOR_TYPES[channels], 0, 0, 0)
-    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(stream)), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        for kind, body in chunks
-    )
+    image = chunk(b"IDAT", zlib.compress(stream))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + facts + image + chunk(b"IEND", b"")
 
 
 def linear(codes, largest):
@@ -146,6 +152,58 @@ def test_palettes_and_single_bits(tmp_path):
     np.testing.assert_allclose(image[..., :3], linear(codes, 255), rtol=3e-7)
     Image.fromarray(np.array([[True, False]])).save(path)
     np.testing.assert_array_equal(io.read_png(path), [[[1], [0]]])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_transparent_colour_has_alpha_0(tmp_path, channels, dtype):
+    codes = np.random.default_rng(0).integers(0, 255, (5, 6, channels)).astype(dtype)
+    codes[2, 3] = codes[4, 1]
+    key = codes[2, 3].astype(">u2").tobytes()
+    (tmp_path / "a.png").write_bytes(png(codes, chunk(b"tRNS", key)))
+    image = io.read_png(tmp_path / "a.png")
+    alpha = np.any(codes != codes[2, 3], axis=2)
+    assert not alpha[4, 1]
+    np.testing.assert_array_equal(image[..., channels], alpha)
+    expected = linear(codes, np.iinfo(dtype).max)
+    np.testing.assert_allclose(image[..., :channels], expected, rtol=3e-7)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_a_transparent_grey_of_few_bits(tmp_path, bits):
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 8 // bits, 1, bits, 0, 0, 0, 0))
+    row = chunk(b"IDAT", zlib.compress(b"\0" + bytes([0b01001110])))
+    values = np.array([[[0b01001110 >> at & 2**bits - 1] for at in range(8 - bits, -1, -bits)]])
+    key = chunk(b"tRNS", struct.pack(">H", values[0, 0, 0]))
+    (tmp_path / "a.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + header + key + row + chunk(b"IEND", b"")
+    )
+    image = io.read_png(tmp_path / "a.png")
+    np.testing.assert_array_equal(image[..., 1:], values != values[0, 0, 0])
+    np.testing.assert_allclose(image[..., :1], linear(values, 2**bits - 1), rtol=3e-7)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.55, 1 / 2.2])
+def test_the_gamma_that_the_file_names(tmp_path, gamma):
+    """1 says linear; that of sRGB, which is no power, means the curve."""
+    codes = np.arange(256, dtype=np.uint8).reshape(8, 8, 4)
+    fact = chunk(b"gAMA", struct.pack(">I", round(1e5 * gamma)))
+    (tmp_path / "a.png").write_bytes(png(codes, fact))
+    curved = codes[..., :3] / 255
+    is_srgb = gamma == 1 / 2.2
+    expected = linear(codes, 255)[..., :3] if is_srgb else curved ** (1 / gamma)
+    image = io.read_png(tmp_path / "a.png")
+    np.testing.assert_allclose(image[..., :3], expected, rtol=1e-6)
+    np.testing.assert_allclose(image[..., 3], codes[..., 3] / 255, rtol=1e-6)
+    (tmp_path / "a.png").write_bytes(png(codes, fact + chunk(b"sRGB", b"\0")))
+    assert_srgb = io.read_png(tmp_path / "a.png")
+    np.testing.assert_allclose(assert_srgb, linear(codes, 255), rtol=3e-7)
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"`write_png\(path\)` must end in `.png`.*a.jpg`"):
+        io.write_png(tmp_path / "a.jpg", np.zeros((4, 5, 3)))
+    assert not list(tmp_path.iterdir())
 
 
 def test_write_takes_any_layout(tmp_path):

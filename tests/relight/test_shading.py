@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from relight_views import FRONT, REFLECTANCES, one_pixel, sun
 
 from jaxfx import (
     AmbientLight,
@@ -20,6 +18,8 @@ from jaxfx import (
     SpotLight,
     relight,
 )
+from tests.cases.relight_views import FRONT, REFLECTANCES, one_pixel, sun
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -275,6 +275,29 @@ def test_render_is_the_sum_of_lights(camera):
     )
 
 
+def test_render_with_shadows_is_the_sum_of_shaded_lights():
+    gbuffer, camera = make_gbuffer(2), make_camera("pinhole", 7, 9)
+    rng = np.random.default_rng(2)
+    lights = [*LIGHTS.values(), PointLight([0.5, 0.5, 1], [1.0, 0.5, 0.2])]
+    nothing = np.asarray(gbuffer.shader) == -1
+    # What is not seen at all has no say, not even as a NaN.
+    dim = [np.where(nothing, np.nan, rng.uniform(0, 1, (7, 9))) for _ in lights]
+    for visible in (dim, [None, *dim[1:]], [*dim[:-1], None]):
+        pairs = zip(lights, visible, strict=True)
+        each = [
+            loop(gbuffer, camera, light) * (1 if v is None else np.nan_to_num(v)[..., None])
+            for light, v in pairs
+        ]
+        image = relight.render(gbuffer, camera, lights, visibilities=visible)
+        np.testing.assert_allclose(image, sum(each), rtol=1e-10)
+    state = relight.start(gbuffer, camera, lights, visibilities=visible)
+    np.testing.assert_allclose(state.image, image, rtol=1e-10)
+    slope = jax.grad(lambda v: jnp.sum(relight.render(*scene, visibilities=[v, *dim[1:]])))
+    scene = gbuffer, camera, lights
+    found = slope(jnp.asarray(np.nan_to_num(dim[0])))
+    np.testing.assert_allclose(found, loop(gbuffer, camera, lights[0]).sum(axis=-1), rtol=1e-10)
+
+
 def test_no_lights_are_black():
     gbuffer = cast(make_gbuffer(0), np.float32)
     image = relight.render(gbuffer, make_camera("pinhole", 7, 9), [])
@@ -302,6 +325,7 @@ def test_gradients_of_render_equal_finite_differences():
     np.testing.assert_allclose(forward.sum(), expected, rtol=1e-7)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_reverse_memory_does_not_grow_with_the_lights():
     size = 64
     gbuffer = make_gbuffer(0, size, size, background=False)
@@ -366,6 +390,8 @@ def test_faults_name_the_argument():
     for visibility in (np.ones((9, 7)), np.ones((7, 9, 1)), 1.0):
         with pytest.raises(ValueError, match=r"`shade\(visibility\)` must have shape \(7, 9\)"):
             shade(gbuffer, camera, light, visibility)
+    with pytest.raises(ValueError, match=r"`shade\(visibility\)` must be in \[0, 1\]"):
+        shade(gbuffer, camera, light, np.full((7, 9), 255))
     with pytest.raises(ValueError, match=rf"`shade\(light\)` must be one of {kinds}, got str"):
         shade(gbuffer, camera, "sun")
     with pytest.raises(ValueError, match=r"`render\(lights\[1\]\)` must be one of .*, got int"):
@@ -375,6 +401,12 @@ def test_faults_name_the_argument():
     ):
         render(gbuffer, camera, light)
     edited = eqx.tree_at(lambda gbuffer: gbuffer.normal, gbuffer, gbuffer.normal[:-1])
+    for visible, message in (
+        ([], "` must hold an image or None for each of 1"),
+        ([1.0], r"\[0\]` must have shape \(7, 9\)"),
+    ):
+        with pytest.raises(ValueError, match=rf"`render\(visibilities=...\){message}"):
+            render(gbuffer, camera, [light], visibilities=visible)
     for call, lights in ((shade, light), (render, [])):
         with pytest.raises(
             ValueError, match=r"`GBuffer\(normal\)` must have shape \(7, 9, 3\)"

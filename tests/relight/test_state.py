@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import relight_scenes
-from quick import quick_jit
 
+from benchmarks.scenes import relight as relight_scenes
 from jaxfx import (
     AmbientLight,
     DirectionalLight,
@@ -20,6 +19,7 @@ from jaxfx import (
     relight,
     scene,
 )
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -127,6 +127,29 @@ def test_visibility_goes_with_its_light():
     assert_close(state.image, expected(state))
 
 
+def test_an_edit_keeps_the_shadow_unless_told_otherwise():
+    rng = np.random.default_rng(5)
+    lights, new = make_lights(4), make_lights(4, seed=8)
+    shadows = [jnp.asarray(rng.uniform(0, 1, SIZE)) for _ in lights]
+    state = relight.start(GBUFFER, CAMERA, lights, visibilities=shadows)
+    for i, light in enumerate(new):
+        shaded = lambda visible, i=i, light=light: relight.render(
+            GBUFFER,
+            CAMERA,
+            [*lights[:i], light, *lights[i + 1 :]],
+            visibilities=[*shadows[:i], visible, *shadows[i + 1 :]],
+        )
+        for edit in (
+            state.edit(i, light),
+            jax.jit(lambda s, n, i=i: s.edit(i, n))(state, light),
+        ):
+            assert_close(edit.image, shaded(shadows[i]))
+            np.testing.assert_array_equal(edit.visibilities[i], shadows[i])
+        without = state.edit(i, light, None)
+        assert without.visibilities[i] is None
+        assert_close(without.image, shaded(None))
+
+
 def test_float32_stays_float32():
     state = relight.start(SINGLE, CAMERA, make_lights(4)).edit(1, make_lights(1)[0])
     assert state.image.dtype == jnp.float32
@@ -183,10 +206,9 @@ def test_a_light_that_is_not_finite_leaves_no_trace(bad):
     """Not even when others were edited in between; meanwhile it shows where it reaches."""
     lights = make_lights(3, kinds=(point,))
     state = relight.start(SINGLE, CAMERA, lights)
-    # As an optimiser may leave it: one that is made so is refused.
-    light = PointLight([0, 0, 0], [1, 1, 1])
-    light = eqx.tree_at(lambda light: light.color, light, jnp.array([bad, 1.0, 1.0]))
-    spoiled = state.edit(1, light)
+    # Made traced, where its numbers can't be looked at.
+    glaring = jax.jit(lambda color: PointLight(jnp.zeros(3), color))(jnp.array([bad, 1, 1]))
+    spoiled = state.edit(1, glaring)
     assert not np.isfinite(spoiled.image).all()
     assert not np.isnan(np.asarray(spoiled.image)[np.asarray(SINGLE.shader) < 0]).any()
     after = spoiled.edit(0, lights[2]).edit(1, lights[1]).edit(0, lights[0])
@@ -202,9 +224,10 @@ def test_a_bad_pixel_stays_where_it_is():
     assert wrong[2, 3] and wrong.sum() == 1
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("count", [10, 100, 1000])
 def test_the_work_of_an_edit_does_not_depend_on_the_number_of_lights(count):
-    """Counted in what is compiled; `tests/benchmarks` has the times."""
+    """Counted in what is compiled; `benchmarks` has the times."""
 
     def work(count):
         lights = make_lights(1, kinds=(point,)) * count
@@ -401,6 +424,8 @@ def test_errors_name_the_argument():
         add(state, 3)
     with pytest.raises(ValueError, match=r"`edit\(visibility\)` must have shape \(7, 9\)"):
         edit(state, 0, light, np.ones((2, 2)))
+    with pytest.raises(ValueError, match=r"`edit\(visibility\)` must be an image, None or"):
+        edit(state, 0, light, "none")
     with pytest.raises(ValueError, match=r"`paint\(mask\)` must have the cache's height"):
         paint(state, np.ones((2, 2), bool), color=NEW)
     with pytest.raises(ValueError, match=r"`paint\(color=...\)` must have shape \(3,\)"):

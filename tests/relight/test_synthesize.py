@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from relight_views import (
+
+from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
+from tests.cases.relight_views import (
     BLUE,
     CAMERAS,
     FRONTAL,
@@ -24,8 +25,7 @@ from relight_views import (
     plane,
     points,
 )
-
-from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -188,6 +188,49 @@ def test_a_bad_pixel_of_a_cache_reaches_only_those_that_read_it(name):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(kept))
     if name in ("normal", "depth"):
         assert np.isfinite(bad.color).all()
+
+
+@pytest.mark.parametrize("name", ["color", "normal", "depth"])
+def test_a_bad_pixel_of_a_cache_spoils_no_derivative_of_the_cameras(name):
+    """Where another cache has the point: by detail, the weights follow the cameras."""
+    gbuffers = [FRONTAL(camera) for camera in CAMERAS]
+    bad = getattr(gbuffers[1], name).at[5:20, 8:25].set(jnp.nan)
+    gbuffers[1] = eqx.tree_at(lambda g: getattr(g, name), gbuffers[1], bad)
+    if name == "color":  # and not seen: another surface
+        gbuffers[1] = eqx.tree_at(lambda g: g.depth, gbuffers[1], 2 * gbuffers[1].depth)
+    depth = FRONTAL(TARGET).depth
+
+    def color(cameras, target):
+        options = {"depth": depth, "weights": "detail", "tolerance": 0.03}
+        return relight.synthesize(gbuffers, cameras, target, **options)[0].color
+
+    @quick_jit
+    def derivatives(cameras, target):
+        value, pull = jax.vjp(color, cameras, target)
+        return value, pull(jnp.ones_like(value)), jax.jvp(color, *[(cameras, target)] * 2)[1]
+
+    for path, leaf in jax.tree_util.tree_leaves_with_path(derivatives(CAMERAS, TARGET)):
+        assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
+
+
+@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan])
+def test_what_is_missing_in_a_depth_is_no_hole_to_fill(missing):
+    """In the new view as background; in a cache, as where it shows nothing."""
+    gbuffers, depth = [FRONTAL(camera) for camera in CAMERAS], FRONTAL(TARGET).depth
+    lost = np.zeros(depth.shape, bool)
+    lost[4:9, 5:12] = True
+    found, covered = [], []
+    for nothing in (np.inf, missing):
+        cached = jnp.where(lost, nothing, gbuffers[0].depth)
+        holed = eqx.tree_at(lambda g: g.depth, gbuffers[0], cached)
+        given = jnp.where(lost, nothing, depth)
+        buffer, coverage = relight.synthesize([holed], CAMERAS[:1], TARGET, depth=given)
+        covered.append((coverage, relight.fill_holes(buffer, coverage)[1]))
+        found.append(relight.fill_holes(buffer, coverage)[0])
+    np.testing.assert_array_equal(covered[1][0], covered[0][0])
+    assert int(covered[1][1]) == int(covered[0][1]) > 0
+    for name in (*FLOATS, "shader"):
+        np.testing.assert_array_equal(*(getattr(each, name) for each in found))
 
 
 def test_detail_favours_the_camera_that_is_nearer():

@@ -8,7 +8,7 @@ from jaxfx._sampling import pixel_centers
 
 
 pytest.importorskip("mitsuba", reason="Mitsuba comes with the `bench` extra.")
-import relight_truth as truth
+from benchmarks.scenes import relight_truth as truth
 
 
 SIZE = (48, 64)

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from reproject_cases import run, slanted_rays
-from reproject_failures import awkward_rays, field, grid_walk
 
+from benchmarks.scenes.reproject import run, slanted_rays
 from jaxfx.reproject import _walk, intersect
+from tests.cases.reproject import awkward_rays, field, grid_walk
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -1,7 +1,8 @@
 """Where the searches that may err do err. Each case is charted in `tests/stability`."""
 
 import pytest
-from reproject_cases import cliff, error_rate, posts
+
+from benchmarks.scenes.reproject import cliff, error_rate, posts
 
 
 pytestmark = pytest.mark.usefixtures("quick")

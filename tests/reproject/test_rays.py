@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reproject_cases import camera
 
+from benchmarks.scenes.reproject import camera
 from jaxfx import OrthographicCamera
 from jaxfx.reproject._rays import view_rays
 
@@ -27,12 +27,14 @@ def test_a_ray_is_the_line_that_its_pixel_sees(kind):
     source, target = camera(), TARGETS[kind]
     rng = np.random.default_rng(0)
     pixels = jnp.asarray(rng.uniform(0, 1, (200, 2)) * [WIDTH, HEIGHT])
-    rays = view_rays(source, target, pixels, shape=(HEIGHT, WIDTH), near=jnp.asarray(0.5))
+    rays = view_rays(source, target, pixels, shape=(HEIGHT, WIDTH), unit=jnp.asarray(0.5))
     inside = np.asarray(rays.inside)
     assert inside.mean() > 0.2
     for time in (0.1, 0.5, 0.9):
-        x, y, negative = np.moveaxis(np.asarray(rays.origin + time * rays.direction), -1, 0)
-        x, y, z = x[inside], y[inside], -1 / negative[inside]
+        runs_away = np.asarray(rays.direction)[:, 2:] > 0  # and is at its origin at time 0
+        points = rays.origin + jnp.asarray(time - runs_away) * rays.direction
+        x, y, negative = np.moveaxis(np.asarray(points), -1, 0)
+        x, y, z = x[inside], y[inside], -0.5 / negative[inside]
         assert (z > 0.5 - 1e-9).all()
         assert (x > -1e-6).all() and (x < WIDTH + 1e-6).all()
         assert (y > -1e-6).all() and (y < HEIGHT + 1e-6).all()
@@ -44,7 +46,7 @@ def test_a_ray_is_the_line_that_its_pixel_sees(kind):
 
 def test_equal_cameras_rays_stay_on_their_pixels_without_rounding():
     pixels = jnp.asarray(np.random.default_rng(0).uniform(0, 1, (50, 2)) * [WIDTH, HEIGHT])
-    rays = view_rays(camera(), camera(), pixels, shape=(HEIGHT, WIDTH), near=jnp.asarray(0.5))
+    rays = view_rays(camera(), camera(), pixels, shape=(HEIGHT, WIDTH), unit=jnp.asarray(0.5))
     assert rays.inside.all()
     np.testing.assert_array_equal(rays.origin[:, :2], pixels)
     np.testing.assert_array_equal(rays.direction[:, :2], 0)

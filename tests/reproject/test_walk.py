@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reproject_cases import run
-from reproject_failures import awkward_rays, field
 
+from benchmarks.scenes.reproject import run
 from jaxfx.reproject._walk import level_of, pack, unpack
+from tests.cases.reproject import awkward_rays, field
 
 
 pytestmark = pytest.mark.usefixtures("quick")

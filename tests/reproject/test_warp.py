@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reproject_cases as cases
-from quick import quick_jit
-from reproject_cases import camera
 
+from benchmarks.scenes import reproject as cases
+from benchmarks.scenes.reproject import camera
 from jaxfx import OrthographicCamera, PinholeCamera, scene
 from jaxfx.reproject import warp
+from tests.helpers.quick import quick_jit
 
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -1,13 +1,16 @@
+import json
 import os
 import subprocess
 import sys
+from types import MappingProxyType
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
-from jaxfx import OrthographicCamera, PinholeCamera, scene
+from jaxfx import OrthographicCamera, PinholeCamera, io, scene
 from jaxfx.scene import _embree, _opengl
 
 
@@ -139,3 +142,120 @@ def fresh_python():
         return done.stdout, done.stderr
 
     return run
+
+
+class GltfFile:
+    """A glTF document that is written down piece by piece, from the standard alone."""
+
+    KINDS = MappingProxyType(
+        {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+    )
+    TYPES = MappingProxyType({1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"})
+
+    def __init__(self, folder):
+        self.folder, self.binary = folder, b""
+        self.json = {"asset": {"version": "2.0"}, "bufferViews": [], "accessors": []}
+
+    def view(self, data, **more):
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
+        self.json["bufferViews"].append(view | more)
+        self.binary += data
+        return len(self.json["bufferViews"]) - 1
+
+    def accessor(self, rows, dtype="f4", *, gap=0, **more):
+        """Rows of numbers, `gap` bytes of rubbish behind each."""
+        rows = np.asarray(rows, f"<{dtype}")
+        rows = rows.reshape(len(rows), -1)
+        data = b"".join(row.tobytes() + b"\xaa" * gap for row in rows)
+        stride = {"byteStride": rows[0].nbytes + gap} if gap else {}
+        view = {"bufferView": self.view(data, **stride)}
+        return self.record(len(rows), rows.shape[1], dtype, **view, **more)
+
+    def record(self, count, width, dtype="f4", **more):
+        kind = {"componentType": self.KINDS[dtype], "type": self.TYPES[width], "count": count}
+        self.json["accessors"].append(kind | more)
+        return len(self.json["accessors"]) - 1
+
+    def quad(self, *, material=None, mode=4, faces=(0, 1, 2, 0, 2, 3), **attributes):
+        """A primitive over [0, 3] x [0, 2] of the plane z = 0."""
+        corners = [[0, 0, 0], [3, 0, 0], [3, 2, 0], [0, 2, 0]]
+        names = {"POSITION": self.accessor(corners)} if "POSITION" not in attributes else {}
+        one = {"attributes": names | attributes, "mode": mode}
+        if faces is not None:
+            one["indices"] = self.accessor(faces, "u2")
+        return one | ({} if material is None else {"material": material})
+
+    def material(self, image, sampler=None, **more):
+        """A dielectric whose base colour is an image; `more` goes into the texture's info."""
+        for key in ("images", "textures", "samplers", "materials"):
+            self.json.setdefault(key, [])
+        self.json["images"].append({"uri": image})
+        texture = {"source": len(self.json["images"]) - 1}
+        if sampler:
+            self.json["samplers"].append(sampler)
+            texture["sampler"] = len(self.json["samplers"]) - 1
+        self.json["textures"].append(texture)
+        info = {"index": len(self.json["textures"]) - 1} | more
+        surface = {"metallicFactor": 0, "baseColorTexture": info}
+        self.json["materials"].append({"pbrMetallicRoughness": surface})
+        return len(self.json["materials"]) - 1
+
+    def save(self, *primitives, name="a.gltf", **top):
+        """The file with one mesh of these primitives, at one node unless `top` says others."""
+        (self.folder / "a.bin").write_bytes(self.binary)
+        whole = {
+            "buffers": [{"byteLength": len(self.binary), "uri": "a.bin"}],
+            "meshes": [{"primitives": list(primitives)}],
+            "nodes": [{"mesh": 0}],
+            "scenes": [{"nodes": [0]}],
+            "scene": 0,
+        }
+        (self.folder / name).write_text(json.dumps(whole | self.json | top))
+        return self.folder / name
+
+
+@pytest.fixture
+def gltf(tmp_path):
+    """A `GltfFile` in the test's folder."""
+    return GltfFile(tmp_path)
+
+
+UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], float)
+TEXELS = np.array(
+    [
+        [[255, 0, 0], [0, 255, 0], [0, 0, 255]],
+        [[200, 100, 50], [10, 128, 240], [77, 33, 11]],
+    ],
+    np.uint8,
+)
+
+
+@pytest.fixture
+def uv():
+    """Texture coordinates of `GltfFile.quad`, as glTF counts v: the image the right way up."""
+    return UV
+
+
+@pytest.fixture
+def texels(tmp_path):
+    """The image `texels.png` in the test's folder, 2 x 3 bytes."""
+    Image.fromarray(TEXELS).save(tmp_path / "texels.png")
+    return TEXELS
+
+
+@pytest.fixture
+def codes(straight):
+    """What a mesh over [0, 3] x [0, 2] shows, `scale` pixels a unit, as sRGB bytes."""
+
+    def look(mesh, scale=1):
+        buffer = scene.gbuffer(
+            mesh,
+            straight(2 * scale, scale),
+            height=2 * scale,
+            width=3 * scale,
+            backend="embree",
+        )
+        return np.rint(255 * io.srgb_from_linear(np.asarray(buffer.color, float))).astype(int)
+
+    return look

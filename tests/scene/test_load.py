@@ -278,7 +278,7 @@ def test_missing_file(tmp_path):
 @pytest.mark.parametrize("name", ["junk.glb", "junk.ply", "junk.xyzzy"])
 def test_unreadable_file(tmp_path, name):
     (tmp_path / name).write_bytes(b"\x00\x01 not a mesh")
-    with pytest.raises(ValueError, match=r"scene\.load\(path\).*mesh that trimesh reads"):
+    with pytest.raises(ValueError, match=r"scene\.load\(path\).*mesh that can be read"):
         scene.load(tmp_path / name)
 
 
@@ -286,7 +286,7 @@ def test_broken_picture(tmp_path):
     path = textured_quad(tmp_path)
     picture = tmp_path / "texels.png"
     picture.write_bytes(picture.read_bytes()[:50])
-    with pytest.raises(ValueError, match=r"scene\.load\(path\).*mesh that trimesh reads"):
+    with pytest.raises(ValueError, match=r"scene\.load\(path\).*mesh that can be read"):
         scene.load(path)
 
 

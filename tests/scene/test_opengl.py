@@ -64,6 +64,61 @@ def test_subpixel_snapping_bends_no_plane(straight):
             np.testing.assert_allclose(slope, slope[0, 0], atol=2e-5)
 
 
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e5])
+def test_a_box_close_by_in_a_large_dome(backend, size):
+    """What is near is seen, however large the scene around it."""
+    dome = trimesh.creation.icosphere(2, radius=3 * size)
+    world = scene.from_trimesh(trimesh.Scene([trimesh.creation.box((1, 1, 1)), dome]))
+    for away in (0.5, 0.01):
+        camera = PinholeCamera.look_at(
+            [0, 0, 0.5 + away], [0, 0, 0], up=[0, 1, 0], fov_y=0.6, height=3, width=3
+        )
+        depth = scene.depth(world, camera, height=3, width=3, backend=backend)
+        np.testing.assert_allclose(depth, away, rtol=1e-5)
+
+
+def test_a_floor_below_the_eye(backend):
+    """It goes on from the eye's own plane to behind it."""
+    floor = trimesh.Trimesh(
+        [[-99, -1, -99], [99, -1, -99], [99, -1, 99], [-99, -1, 99]], [[0, 2, 1], [0, 3, 2]]
+    )
+    camera = PinholeCamera.look_at(
+        [0, 0, 0], [0, -1, -1], up=[0, 1, 0], fov_y=1.5, height=8, width=6
+    )
+    depth = scene.depth(scene.from_trimesh(floor), camera, height=8, width=6, backend=backend)
+    angle = np.arctan(np.tan(0.75) * (np.arange(8) - 3.5) / 4)
+    expected = np.cos(angle) / np.cos(np.pi / 4 - angle)
+    np.testing.assert_allclose(depth[:, 3], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("height", "width"), [(2, 20000), (20000, 1)])
+def test_wider_than_opengl_draws_at_once(backend, straight, height, width):
+    """Squares of 125 pixels in a row, each a face of its own pair: which one is where."""
+    side, count = 125, 160
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    step = np.array([1, 0, 0] if width > height else [0, 1, 0])
+    vertices = np.concatenate([corners + i * step for i in range(count)])
+    faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(count)])
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    row = scene.from_trimesh(mesh)
+    owned = scene.Scene(
+        **{
+            name: getattr(row, name)
+            for name in ("vertices", "faces", "normals", "uv", "colors")
+        },
+        materials=row.materials,
+        face_materials=row.face_materials,
+        names=tuple(map(str, range(count))),
+        face_objects=np.repeat(np.arange(count), 2),
+    )
+    ids = scene.object_ids(
+        owned, straight(height, side), height=height, width=width, backend=backend
+    )
+    along = np.arange(20000) // side
+    expected = along if width > height else along[::-1, None]
+    np.testing.assert_array_equal(ids, np.broadcast_to(expected, (height, width)))
+
+
 def test_without_embree_and_opengl(fresh_python):
     printed, complaint = fresh_python(
         "complain('embree'); complain('auto')",

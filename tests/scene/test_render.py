@@ -98,3 +98,21 @@ def test_bad_scenes_and_cameras(ball, view, monkeypatch):
         scene.depth(ball, flat, **SIZE)
     with pytest.raises(ValueError, match="must be concrete, got a traced camera"):
         jax.jit(lambda c: scene.depth(ball, c, **SIZE))(view)
+
+
+def test_a_place_that_is_rounded_is_said(backend, caplog):
+    """Thousands of kilometres from the origin float32 has steps of a quarter of a unit."""
+    place = np.array([4.1e6, 0, 2.9e6])
+    aside = np.array([0.37, 0.21, 3.63])
+    box = trimesh.creation.box((1, 1, 1)).apply_translation(place)
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = place + aside
+    focal = np.array([[60.0, 0, 8], [0, 60, 8], [0, 0, 1]])
+    draw = lambda camera: scene.depth(
+        scene.from_trimesh(box), camera, height=16, width=16, backend=backend
+    )
+    assert float(draw(PinholeCamera(focal, pose)).min()) == pytest.approx(3.13, abs=1e-6)
+    assert not caplog.records
+    draw(PinholeCamera(focal.astype(np.float32), pose.astype(np.float32)))
+    (record,) = caplog.records
+    assert "the camera's place is rounded to 0.12 in float32" in record.getMessage()

@@ -56,6 +56,18 @@ def test_bounding_box_is_of_the_triangles():
         ({"faces": np.zeros((0, 3), int)}, r"Scene\(faces=...\)` must hold at least one"),
         ({"faces": np.array([[0, 1, 3]])}, r"Scene\(faces=...\)` must be indices in \[0, 3\)"),
         ({"vertices": np.full((3, 3), np.inf)}, r"Scene\(vertices=...\)` must be finite"),
+        ({"uv": np.full((1, 3, 2), np.nan)}, r"Scene\(uv=...\)` must be finite.* face 0; 1 of"),
+        ({"normals": np.full((1, 3, 3), np.inf)}, r"Scene\(normals=...\)` must be finite"),
+        ({"colors": np.full((1, 3, 3), np.nan)}, r"Scene\(colors=...\)` must be finite"),
+        ({"second_uv": np.zeros((2, 3, 2))}, r"Scene\(second_uv=...\)` must have shape"),
+        (
+            {
+                "materials": (
+                    scene.Material(samplers={"texture": scene.Sampler(second_uv=True)}),
+                )
+            },
+            r"Scene\(second_uv=...\)` must be given",
+        ),
         ({"normals": np.ones((2, 3, 3))}, r"Scene\(normals=...\)` must have shape \(1, 3, 3\)"),
         ({"face_materials": np.ones(1, int)}, r"Scene\(face_materials=...\)` must be indices"),
         ({"face_objects": -np.ones(1, int)}, r"Scene\(face_objects=...\)` must be indices"),
@@ -75,8 +87,25 @@ def test_bad_scenes(changes, complaint):
         {"texture": np.zeros((2, 2, 3))},
         {"metallic_roughness": np.zeros((2, 2), np.uint8)},
         {"normal_map": np.zeros((2, 2, 3))},
+        {"texture": np.zeros((2, 2, 3), np.uint32)},
+        {"normal_scale": np.nan},
+        {"samplers": {"bump": scene.Sampler()}},
     ],
 )
 def test_bad_materials(wrong):
     with pytest.raises(ValueError, match=rf"`Material\({next(iter(wrong))}=...\)` must"):
         build(scene.Material, **wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"wrap": ("repeat", "stretch")},
+        {"wrap": ("repeat",)},
+        {"transform": ((1, 0), (0, 1))},
+        {"transform": ((1, 0, np.nan), (0, 1, 0))},
+    ],
+)
+def test_bad_samplers(wrong):
+    with pytest.raises(ValueError, match=rf"`Sampler\({next(iter(wrong))}=...\)` must"):
+        build(scene.Sampler, **wrong)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from shadow_scenes import noise
+
+from benchmarks.scenes.shadow import noise
 
 
 def naive_pcf(shadow_map, receivers, size, bias=0.0, slope_bias=0.0):

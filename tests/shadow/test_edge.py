@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from shadow_scenes import noise, plate, steps
 
+from benchmarks.scenes.shadow import noise, plate, steps
 from jaxfx import shadow
 from jaxfx.shadow.edge import usual_dilation
+from tests.helpers.quick import quick_jit
 
 from .conftest import naive_pcf
 
@@ -35,7 +35,7 @@ def test_depth_mask_is_pcf_in_every_form(kernel, softness):
 @pytest.mark.parametrize("size", [3, 9])
 def test_depth_mask_is_where_the_comparisons_differ(size):
     case = steps(4, np.float64)
-    found = shadow.candidates(*case, size=size, mask="depth")
+    found = shadow.candidates(*case, size=size, mask="depth", bias=0.0)
     share = naive_pcf(
         case[0], case[1]._replace(z=np.where(np.isfinite(case[1].z), case[1].z, -1)), size
     )
@@ -68,7 +68,8 @@ def test_screen_mask_misses_less_the_farther_edges_reach():
     case = plate(4.0, 4)
     full = shadow.pcf(*case, size=7)
     differing = [
-        int(jnp.sum(shadow.edge_pcf(*case, size=7, dilation=d) != full)) for d in (1, 16)
+        int(jnp.sum(shadow.edge_pcf(*case, size=7, mask="screen", dilation=d) != full))
+        for d in (1, 16)
     ]
     assert differing == sorted(differing, reverse=True)
     assert differing[0] > 96
@@ -82,15 +83,16 @@ def test_screen_mask_loses_a_shadow_between_pixels():
     assert (shadow.hard(shadow_map, receivers) == 1).all()
     full = shadow.pcf(shadow_map, receivers, size=7)
     assert full.min() < 1
-    assert (shadow.edge_pcf(shadow_map, receivers, size=7, dilation=3) == 1).all()
-    exact = shadow.edge_pcf(shadow_map, receivers, size=7, mask="depth")
+    screen = {"mask": "screen", "dilation": 3}
+    assert (shadow.edge_pcf(shadow_map, receivers, size=7, **screen) == 1).all()
+    exact = shadow.edge_pcf(shadow_map, receivers, size=7)
     np.testing.assert_array_equal(exact, full)
 
 
 def test_screen_mask_loses_an_edge_beyond_the_frame():
     """The filter reaches the plate's ends, which the picture does not show."""
     case = plate(8.0, 16)
-    assert (shadow.edge_pcf(*case, size=7) == 0).all()
+    assert (shadow.edge_pcf(*case, size=7, mask="screen") == 0).all()
     assert shadow.pcf(*case, size=7).max() == pytest.approx(1 / 7)
 
 
@@ -101,6 +103,15 @@ def test_nothing_to_filter_is_nothing_done(case):
         assert not found.where.any()
         assert found.comparisons == found.where.size * (2 if mask == "depth" else 1)
         assert (shadow.edge_pcf(lit, case[1], size=7, mask=mask) == 1).all()
+
+
+def test_the_mask_by_depth_is_the_default_and_needs_no_dilation(case):
+    options = {"size": 5, "kernel": "tent", "bias": 0.02}
+    visible = jax.jit(ft.partial(shadow.edge_pcf, **options))(*case)
+    np.testing.assert_allclose(visible, shadow.pcf(*case, **options), atol=1e-12)
+    default, depth = (shadow.candidates(*case, size=5, **o) for o in ({}, {"mask": "depth"}))
+    np.testing.assert_array_equal(default.where, depth.where)
+    assert default.comparisons == depth.comparisons
 
 
 def test_derivatives_are_pcfs():
@@ -126,11 +137,13 @@ def test_faults_name_their_argument(case):
     for name, options in {
         "size=...": {"size": 4},
         "mask=...": {"size": 3, "mask": "stencil"},
-        "dilation=...": {"size": 3, "dilation": 0},
+        "dilation=...": {"size": 3, "mask": "screen", "dilation": 0},
         "kernel=...": {"size": 3, "kernel": "disc"},
     }.items():
         with pytest.raises(ValueError) as caught:
             function(*case, **options)
         assert str(caught.value).startswith(f"`edge_pcf({name})`")
     with pytest.raises(ValueError, match=r"`edge_pcf\(dilation=...\)` must be given under"):
-        jax.jit(ft.partial(function, size=3))(*case)
+        jax.jit(ft.partial(function, size=3, mask="screen"))(*case)
+    with pytest.raises(ValueError, match=r"`edge_pcf\(dilation=...\)` must be left out with"):
+        function(*case, size=3, dilation=2)

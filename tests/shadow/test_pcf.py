@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
-from shadow_scenes import noise
 
+from benchmarks.scenes.shadow import noise
 from jaxfx import shadow
+from tests.helpers.quick import quick_jit
 
 from .conftest import naive_pcf
 
@@ -71,8 +71,8 @@ def test_what_is_lit_whatever_the_map_says(kernel, softness):
 
 def test_equal_depth_is_lit():
     wall = np.full((3, 3), 2.0)
-    assert shadow.hard(wall, one(1, 1, 2.0))[0, 0] == 1
-    assert shadow.hard(wall, one(1, 1, np.nextafter(2.0, 3)))[0, 0] == 0
+    assert shadow.hard(wall, one(1, 1, 2.0), bias=0.0)[0, 0] == 1
+    assert shadow.hard(wall, one(1, 1, np.nextafter(2.0, 3)), bias=0.0)[0, 0] == 0
     assert shadow.hard(wall, one(1, 1, 2.5), bias=0.5)[0, 0] == 1
     assert shadow.hard(wall, one(1, 1, 2.5, slope=0.25), slope_bias=2.0)[0, 0] == 1
 
@@ -100,7 +100,9 @@ def test_a_bad_texel_or_receiver_spoils_only_its_own(case, kernel):
 @pytest.mark.parametrize("map_shape", [(1, 1), (1, 9), (3, 2)])
 def test_a_map_smaller_than_the_filter(map_shape):
     case = noise(map_shape=map_shape)
-    np.testing.assert_allclose(shadow.pcf(*case, size=7), naive_pcf(*case, 7), atol=1e-15)
+    np.testing.assert_allclose(
+        shadow.pcf(*case, size=7, bias=0.0), naive_pcf(*case, 7), atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("size", [0, 2, 4, -3, 3.0, True])
@@ -125,8 +127,13 @@ def test_other_faults_name_their_argument(case):
         with pytest.raises(ValueError) as caught:
             pcf(*data, size=3, **options)
         assert str(caught.value).startswith(f"`pcf({name})`")
-    with pytest.raises(ValueError, match="must hold floats"):
-        pcf(np.ones((3, 3), int), receivers, size=3)
+
+
+def test_an_integer_map_is_read_as_depths():
+    _, receivers = noise()
+    whole = np.random.default_rng(1).integers(1, 4, (14, 17))
+    found, expected = (shadow.pcf(m, receivers, size=3) for m in (whole, whole.astype(float)))
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx import OrthographicCamera, PinholeCamera, shadow
+from tests.helpers.quick import quick_jit
 
 
 SIDE = 128

@@ -30,8 +30,9 @@ def test_weights_fall_to_nothing_where_the_next_tap_takes_over(kernel, size):
     np.testing.assert_allclose(weight(-offsets), weight(offsets))
 
 
-def test_nothing_lies_nearer_outside_the_map_and_a_nan_is_infinitely_far():
-    shadow_map = np.array([[1.0, np.nan], [2.0, 3.0]])
+@pytest.mark.parametrize("missing", [np.nan, 0.0, -1.0])
+def test_nothing_lies_nearer_outside_the_map_and_what_is_missing_is_infinitely_far(missing):
+    shadow_map = np.array([[1.0, missing], [2.0, 3.0]])
     padded = np.asarray(_taps.pad_map(jnp.asarray(shadow_map), 3, jnp.float64))
     known = np.zeros(padded.shape, bool)
     known[3:5, 3:5] = True

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from shadow_scenes import WHITE, Still, acne_and_leaks
 
+from benchmarks.scenes.shadow import WHITE, Still, acne_and_leaks
 from jaxfx import PointLight, shadow
 
 

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx import shadow
+from tests.helpers.quick import quick_jit
 
 
 def at(u, v, z):
@@ -20,7 +20,7 @@ def test_two_depths_meet_the_bound():
     shadow_map = np.full((9, 9), 4.0)
     shadow_map[:, :4] = 1.0
     for u in (3.5, 4.5, 5.5):
-        found = shadow.variance(shadow_map, at(u, 4.5, 4.0), size=5)[0, 0]
+        found = shadow.variance(shadow_map, at(u, 4.5, 4.0), size=5, bias=0.0)[0, 0]
         share = shadow.pcf(shadow_map, at(u, 4.5, 4.0), size=5)[0, 0]
         assert float(found) == pytest.approx(float(share), abs=1e-12)
 

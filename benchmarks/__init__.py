@@ -1,0 +1,4 @@
+"""Timings, native peers and charts.
+
+`pytest --benchmark-only benchmarks` times; `python -m benchmarks.NAME` draws a chart.
+"""

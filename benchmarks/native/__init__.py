@@ -1,0 +1,1 @@
+"""The same sums in native code: parallel loops, compiled by numba."""

@@ -1,0 +1,1 @@
+"""Scenes that charts, notebooks and tests share."""

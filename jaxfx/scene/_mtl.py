@@ -1,0 +1,158 @@
+"""MTL files: the materials of OBJ files.
+
+Source: Wavefront's MTL, as in Bourke 1995.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfx.io import linear_from_srgb
+from jaxfx.scene._images import find_file, read_image
+from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._part import UnreadableError
+
+
+PLAIN = Material(color=(0.8, 0.8, 0.8))
+_READ = {"kd", "ks", "ns", "illum", "map_kd"}
+# Not used, and written by exporters of every material.
+_QUIET = {"ka", "tf", "ni", "sharpness", "tr", "d", "ke", "km"}
+_OPTIONS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}  # the most numbers that follow; else a word
+_HARMLESS = {"-blendu", "-blendv", "-texres", "-boost", "-imfchan", "-cc", "-bm", "-type"}
+
+
+class Library:
+    """The materials of an OBJ file's libraries, made where they are asked for."""
+
+    def __init__(self):
+        self.ignored: set[str] = set()
+        self._records: dict[str, tuple[Path, dict[str, str]]] = {}
+        self._images: dict[Path, np.ndarray] = {}
+        self._made: dict[tuple[str, bool], Material] = {}
+
+    def read(self, path: Path) -> None:
+        """Add a file's materials; of two with one name, the first one stays."""
+        record: dict[str, str] | None = None
+        for line in path.read_bytes().decode("utf-8-sig", "surrogateescape").splitlines():
+            word, _, rest = " ".join(line.split("\t")).strip().partition(" ")
+            key, rest = word.lower(), rest.strip()
+            if not key or key.startswith("#"):
+                continue
+            if key == "newmtl":
+                record = {}
+                if self._records.setdefault(rest, (path, record))[1] is not record:
+                    self.ignored.add(f"a second material {rest!r}")
+            elif record is None:
+                raise UnreadableError(f"{path.name!r} has {word!r} before any newmtl")
+            elif key in _READ:
+                record[key] = rest
+            elif key not in _QUIET or _matters(key, rest):
+                self.ignored.add(f"{word} of materials")
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._records
+
+    def get(self, name: str, *, has_uv: bool) -> Material:
+        """A material by name; without its texture where there are no coordinates for it."""
+        if (name, has_uv) not in self._made:
+            self._made[name, has_uv] = self._make(name, has_uv)
+        return self._made[name, has_uv]
+
+    def _make(self, name: str, has_uv: bool) -> Material:
+        path, record = self._records[name]
+        texture, sampler = None, Sampler()
+        if "map_kd" in record:
+            file, sampler = _map(record["map_kd"], path)
+            texture = self._image(file) if has_uv else None
+            if not has_uv:
+                self.ignored.add(f"the texture of {name!r} on faces without vt")
+        if "kd" in record:
+            color = tuple(linear_from_srgb(_color(record, "kd")).tolist())
+        else:
+            color = (1.0, 1.0, 1.0) if "map_kd" in record else PLAIN.color
+        shines = "ks" in record and _color(record, "ks").any()
+        if "illum" in record:
+            shines = shines and _numbers(record["illum"], "illum", 1, 1)[0] not in (0, 1)
+        exponent = 0.0
+        if "ns" in record:
+            exponent = max(_numbers(record["ns"], "Ns", 1, 1)[0], 0.0) if shines else 0.0
+        return Material(
+            color=color,
+            texture=texture,
+            roughness=float((2 / (exponent + 2)) ** 0.5),
+            samplers={} if texture is None else {"texture": sampler},
+        )
+
+    def _image(self, path: Path) -> np.ndarray:
+        if path not in self._images:
+            self._images[path] = read_image(path.read_bytes(), str(path))
+        return self._images[path]
+
+
+def _matters(key: str, rest: str) -> bool:
+    """Whether a statement that is left out says more than the default."""
+    if key in ("d", "ke"):
+        try:
+            values = [float(word) for word in rest.split("#", maxsplit=1)[0].split()]
+        except ValueError:
+            return True
+        return values[:1] != [1] if key == "d" else any(values)
+    return False
+
+
+def _numbers(text: str, name: str, least: int, most: int) -> list[float]:
+    words = text.split("#", maxsplit=1)[0].split()
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if not least <= len(values) <= most or not np.isfinite(values).all():
+        raise UnreadableError(f"a material has {name} {text!r}, which is not read")
+    return values
+
+
+def _color(record: dict[str, str], key: str) -> Float[np.ndarray, "3"]:
+    """Three numbers, or one for all three."""
+    name = key.capitalize()
+    values = _numbers(record[key], name, 1, 3)
+    if len(values) == 2 or min(values) < 0:
+        raise UnreadableError(f"a material has {name} {record[key]!r}, which is not read")
+    return np.array(values if len(values) == 3 else values * 3)
+
+
+def _map(text: str, path: Path) -> tuple[Path, Sampler]:
+    """The file of a map statement, and how its options say to read it."""
+    words = {"-s": [1.0, 1.0], "-o": [0.0, 0.0], "-t": [0.0], "-mm": [0.0, 1.0]}
+    clamp, rest = "off", text
+    while rest.startswith("-"):
+        option, _, after = rest.partition(" ")
+        key = option.lower()
+        if key not in _OPTIONS and key not in _HARMLESS and key != "-clamp":
+            break  # a name that begins with a dash
+        rest = after.strip()
+        if key in _OPTIONS:
+            values = []
+            while len(values) < _OPTIONS[key]:
+                word, _, after = rest.partition(" ")
+                try:
+                    values.append(float(word))
+                except ValueError:
+                    break
+                rest = after.strip()
+            if not values or not np.isfinite(values).all():
+                raise UnreadableError(f"a map has {text!r}, with no number behind {option}")
+            words[key] = values
+        elif key == "-clamp":
+            clamp, _, rest = rest.partition(" ")
+        else:
+            rest = rest.partition(" ")[2]
+        rest = rest.strip()
+    if any(words["-t"]) or words["-mm"] != [0, 1] or clamp not in ("on", "off"):
+        raise UnreadableError(f"a map has {text!r}: its turbulence or range is not read")
+    (x, y), (u, v) = ([*words[key], default][:2] for key, default in (("-s", 1), ("-o", 0)))
+    wrap = "clamp" if clamp == "on" else "repeat"
+    sampler = Sampler((wrap, wrap), transform=((x, 0, u), (0, y, v)))
+    if rest[:1] == rest[-1:] and rest[:1] in ("'", '"'):
+        return find_file(path.parent, rest[1:-1], rest), sampler
+    return find_file(path.parent, rest), sampler

@@ -1,0 +1,1 @@
+"""The cases in which methods fail, effect by effect, and their registry."""

@@ -1,0 +1,48 @@
+"""Programs that are quick to compile, for tests that ask neither for speed nor for memory."""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+from jax.test_util import check_jvp, check_vjp
+
+
+# Compiling is most of the tests' work. What a user runs is compiled with all optimisation: that
+# it is right too is shown by tests of values, which call `jax.jit` or the function alone.
+quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@contextlib.contextmanager
+def _compiled(is_optimised: bool) -> Iterator[None]:
+    """Compile with all optimisation, or with little, whatever is compiled in this context.
+
+    JAX keeps compiled programs by function, types and a few settings, of which optimisation is
+    not one. The precision of matrix products is: it changes no value on a CPU, and keeps the
+    two kinds of programs apart.
+    """
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", not is_optimised)
+    try:
+        with jax.default_matmul_precision(None if is_optimised else "highest"):
+            yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
+
+
+quickly = functools.partial(_compiled, False)
+optimised = functools.partial(_compiled, True)
+
+
+def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: float) -> None:
+    """Compare first derivatives in both modes with finite differences, in three programs.
+
+    `jax.test_util.check_grads` does the same and compiles each mode several times.
+    """
+    value, push = quick_jit(function), quick_jit(functools.partial(jax.jvp, function))
+    pull = quick_jit(lambda at, weight: jax.vjp(function, *at)[1](weight))
+    check_jvp(value, push, arguments, **tolerances)
+    check_vjp(
+        value, lambda *at: (value(*at), functools.partial(pull, at)), arguments, **tolerances
+    )

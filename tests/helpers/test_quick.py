@@ -1,0 +1,21 @@
+import jax
+import jax.numpy as jnp
+
+from tests.helpers.quick import quickly
+
+
+def test_quick_programs_are_kept_apart_from_others():
+    traces = []
+
+    @jax.jit
+    def double(x):
+        traces.append(is_quick)
+        return 2 * x
+
+    for _ in range(2):
+        is_quick = False
+        double(jnp.ones(3))
+        is_quick = True
+        with quickly():
+            double(jnp.ones(3))
+    assert traces == [False, True]
