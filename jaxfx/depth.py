@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxfx._arguments import check_camera
 from jaxfx._checks import as_array, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
 from jaxfx._numerics import working_dtype
@@ -164,6 +165,7 @@ def from_ray_distance(
     **Gradient:** exact in `distance` and the camera's intrinsics; zero where the depth is
     missing or inf, and in the pose.
     """
+    check_camera("from_ray_distance(camera)", camera)
     values, is_nothing = _numbers_and_sky("from_ray_distance(distance)", distance, None)
     is_known = (values > 0) & ~is_nothing
     known = jnp.where(is_known, values, 1)

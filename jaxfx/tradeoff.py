@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfx import metrics
+from jaxfx._checks import Number, WholeNumber, check_image, number, whole_number
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, write_whole
 from jaxfx._progress import counted
@@ -60,8 +61,8 @@ def measure(
     reference: Float[ArrayLike, "height width channel"],
     *,
     mask: Bool[ArrayLike, "height width"] | None = None,
-    repeats: int = 7,
-    max_seconds: float = 2.0,
+    repeats: WholeNumber = 7,
+    max_seconds: Number = 2.0,
     memory: bool = True,
     progress: bool = False,
 ) -> list[Measurement]:
@@ -77,7 +78,7 @@ def measure(
       reference's shape; it is waited for.
     - `reference`: height width channel, linear radiance.
     - `mask`: height width, the pixels that `band_psnr` is about; those near depth edges, say.
-    - `repeats`: calls to time, a scalar count.
+    - `repeats`: calls to time, a positive integer.
     - `max_seconds`: of timed calls for each method; a first call over it is the only one.
     - `memory`: trace each method and compile it once more, to know its memory: that of the
       program that `jax.jit` makes of it, what it closes over counted as arguments. A method
@@ -87,13 +88,18 @@ def measure(
 
     **Returns:** a list of `Measurement`, in the order of `methods`.
 
-    **Raises:** `ValueError` for no methods, or a picture of another shape than the reference's.
+    **Raises:** `ValueError` for no methods, a picture of another shape than the reference's, or
+    a number that is out of range.
 
     **Gradient:** none: it measures.
     """
     if not methods:
         raise ValueError("`measure(methods)` must hold at least one method, got none.")
-    reference = jax.numpy.asarray(reference)
+    reference = check_image("measure(reference)", reference)
+    repeats = whole_number("measure(repeats=...)", repeats)
+    max_seconds = number(
+        "measure(max_seconds=...)", max_seconds, lambda x: x >= 0, "0 or positive"
+    )
     measurements = []
     for name, method in counted(methods.items(), progress, "measure"):
         image, first = _timed(method)

@@ -47,7 +47,7 @@ DEPTH = RNG.uniform(2.0, 2.2, SIZE)
 CAMERA = PinholeCamera.from_fov(0.9, height=SIZE[0], width=SIZE[1])
 FLAT = OrthographicCamera(6.0, [8.0, 6.0], np.eye(4))
 LENS = ThinLens(0.1, 2.1, 30.0)
-WIDE = ThinLens(5.0, 2.6, 30.0)
+WIDE = ThinLens(3.0, 2.1, 30.0)
 LIGHT = PointLight([0.0, -1.0, 0.0], [1.0, 1.0, 1.0])
 NORMAL = np.broadcast_to([0.0, 0, -1], (*SIZE, 3))
 ROUGH = np.full(SIZE, 0.5)
@@ -354,6 +354,7 @@ MAY_BE_NONE = {
     *("visibility", "sigma", "softness", "normal", "color", "diffuse", "specular", "roughness"),
     *("bias", "slope_bias"),
 }
+GUIDES = {("depth.fill", "image")}
 
 ARRAYS = [
     (name, argument)
@@ -367,7 +368,7 @@ ARRAYS = [
 def test_what_is_no_array_is_named(name, argument):
     function, arguments = CALLS[name]
     for kind, make in WRONG.items():
-        if kind == "None" and argument in MAY_BE_NONE:
+        if kind == "None" and (argument in MAY_BE_NONE or (name, argument) in GUIDES):
             continue
         if kind == "masked" and name.startswith("depth."):
             continue  # A mask says there that a depth is missing.
@@ -483,7 +484,16 @@ def test_check_camera_and_check_light():
 def test_no_function_is_forgotten():
     """Every public function of arrays, and every type of ours, has its good call."""
     host = {"scene", "exr", "io", "tradeoff"}
-    records = {"Plan", "Accumulation", "Choice", "Hit", "Receivers", "Candidates", "Lens"}
+    records = {
+        "Plan",
+        "Accumulation",
+        "Choice",
+        "Hit",
+        "Receivers",
+        "Candidates",
+        "Filled",
+        "Lens",
+    }
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfx._arguments import check_camera, check_lens
-from jaxfx._checks import Number
+from jaxfx._checks import Number, as_numpy
 from jaxfx.budget._plan import Plan, check_call, plan
 from jaxfx.camera import PinholeCamera
 from jaxfx.dof.accumulate import accumulate as passes
@@ -73,7 +73,8 @@ def accumulate(
 
     def kept(eye: PinholeCamera) -> ArrayLike:
         started = time.perf_counter()
-        pictures.append(np.asarray(render(eye), np.float64))
+        picture = as_numpy("accumulate(render)", render(eye))
+        pictures.append(picture.astype(np.float64))
         seconds.append(time.perf_counter() - started)
         return pictures[-1]
 

@@ -161,3 +161,23 @@ def test_a_plan_is_made_outside_of_transforms():
         jax.jit(lambda image: budget.dof(image, depth, lens, max_error=1.0).predicted_error)(
             image
         )
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_missing_depths_and_lenses_of_ones_own(own):
+    image, depth, thin = scene(np.random.default_rng(5), 9.0, (24, 30))
+    depth = depth.at[3:7, 4:9].set(0).at[20, 20].set(np.nan)
+
+    class Own:
+        focus_distance = float(thin.focus_distance)
+        defocus = staticmethod(thin.defocus)
+        circle_of_confusion = staticmethod(thin.circle_of_confusion)
+
+    lens = Own() if own else thin
+    plan = budget.dof(image, depth, lens, max_error=0.01)
+    error = plan(image, depth, lens) - dof.scatter(image, depth, lens)
+    assert np.isfinite(error).all()
+    assert np.sqrt(np.mean(np.square(error))) <= 0.01
+    octave = Method("scatter in octaves", max_coc=10.0, split=8.0)(image, depth, lens)
+    exact = dof.scatter(image, depth, thin, max_coc=10.0)
+    assert np.sqrt(np.mean(np.square(octave - exact))) < 0.02

@@ -211,3 +211,52 @@ def test_faults_name_the_argument():
     sizes = iter([(4, 4, 1), (4, 5, 1)])
     with pytest.raises(ValueError, match=r"one shape, got \(4, 4, 1\), then \(4, 5, 1\)"):
         call(lambda eye: jnp.zeros(next(sizes)), CAMERA, LENS, samples=2, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "result"),
+    [
+        (np.uint8, 200, np.float64),
+        (np.uint16, 60000, np.float64),
+        (np.float16, 400, np.float16),
+        (">f4", 0.3, np.float32),
+        (np.float32, 0.1, np.float32),
+    ],
+)
+def test_pictures_of_other_types_are_summed_as_floats(kind, value, result):
+    """256 of them: their sum is beyond what bytes and halves hold."""
+    picture = np.full((2, 2, 3), value, kind)
+    rounding = float(256 * np.finfo(np.float32).eps)  # of a sum of so many
+    found = accumulate(lambda _: picture, samples=256)
+    assert found.image.dtype == result
+    np.testing.assert_allclose(found.image.astype(float), picture.astype(float), rtol=rounding)
+    assert found.convergence < rounding * value
+    one = accumulate(lambda _: picture, samples=1).image
+    np.testing.assert_array_equal(one, picture.astype(result))
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (None, "must be an array, got None"),
+        (np.ones((4, 5)), r"must be an image of shape \(height, width, channel\)"),
+        (np.ma.masked_array(np.ones((4, 5, 3))), "got a masked array"),
+        ({"R": np.ones((4, 5))}, "one array, got a dict"),
+        (np.ones((4, 5, 3), bool), "must hold real numbers, got bool"),
+    ],
+)
+def test_pictures_that_are_none(picture, message):
+    with pytest.raises(ValueError, match=rf"`accumulate\(render\)` .*{message}|{message}"):
+        inspect.unwrap(dof.accumulate)(lambda _: picture, CAMERA, LENS, progress=False)
+
+
+def test_numbers_of_passes():
+    call = inspect.unwrap(dof.accumulate)
+    picture = lambda _: np.ones((2, 2, 1))
+    for samples in (np.int64(2), np.uint8(2)):
+        call(picture, CAMERA, LENS, samples=samples, seed=np.int32(1), progress=False)
+    for wrong in (True, 2.0, 0, "2"):
+        with pytest.raises(ValueError, match=r"`accumulate\(samples=...\)` must be a positive"):
+            call(picture, CAMERA, LENS, samples=wrong, progress=False)
+    with pytest.raises(ValueError, match=r"`accumulate\(seed=...\)` must be an integer from 0"):
+        call(picture, CAMERA, LENS, seed=-1, progress=False)

@@ -268,3 +268,20 @@ def test_bad_arguments_are_named(message, fault):
     call, _, rest = message.partition(" ")
     with pytest.raises(ValueError, match=re.escape(f"`{call}` {rest}")):
         inspect.unwrap(fit.dof)(**given | {"progress": False} | fault)
+
+
+def test_missing_depths_do_not_spoil_a_fit():
+    """A tenth of the depths is missing, by each of the signs for it."""
+    reference, image, depth = picture()
+    holed = np.array(depth)
+    holes = np.random.default_rng(1).random(holed.shape) < 0.1
+    holed[holes] = np.resize([0.0, np.nan, -1.0], holes.sum())
+    exact = dof.scatter(image, holed, **options(TRUTH), max_coc=16)
+    result = fit.dof(
+        exact, image, holed, **options(wrong((0, 1, 0, 1))), max_coc=16, progress=False
+    )
+    assert np.isfinite(result.losses).all()
+    for name, value in found(result).items():
+        assert value == pytest.approx(TRUTH[name], rel=0.02), name
+    with pytest.raises(ValueError, match=r"`dof\(depth\)` must be known somewhere, got"):
+        inspect.unwrap(fit.dof)(reference, image, 0 * holed, options(TRUTH)["lens"])

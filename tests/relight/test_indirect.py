@@ -78,6 +78,20 @@ def test_no_lights_and_ambient_ones_bring_nothing():
         assert not np.asarray(relight.indirect(CACHE, TRANSFER, lights)).any()
 
 
+def test_what_scene_visible_gives_is_lit():
+    """Booleans are 0 and 1, and numbers beyond those no share."""
+    lit = RNG.uniform(size=POINTS) < 0.5
+    given = [None, lit, lit.tolist(), ~lit]
+    as_numbers = [None, *(np.array(each, float) for each in given[1:])]
+    np.testing.assert_array_equal(
+        relight.indirect(CACHE, TRANSFER, LIGHTS, lit=given),
+        relight.indirect(CACHE, TRANSFER, LIGHTS, lit=as_numbers),
+    )
+    indirect = inspect.unwrap(relight.indirect)
+    with pytest.raises(ValueError, match=r"`indirect\(lit=...\)\[1\]` must be in \[0, 1\]"):
+        indirect(CACHE, TRANSFER, LIGHTS, lit=[None, 255.0 * lit, None, None])
+
+
 def test_a_bad_pixel_stays_where_it_is():
     bad = eqx.tree_at(lambda g: g.diffuse, CACHE, CACHE.diffuse.at[1, 1].set(np.nan))
     image = np.asarray(relight.indirect(bad, TRANSFER, LIGHTS, lit=LIT))

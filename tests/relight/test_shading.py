@@ -412,3 +412,80 @@ def test_faults_name_the_argument():
             ValueError, match=r"`GBuffer\(normal\)` must have shape \(7, 9, 3\)"
         ):
             call(edited, camera, lights)
+
+
+def test_booleans_are_visibilities():
+    gbuffer, camera = make_gbuffer(3), make_camera("pinhole", 7, 9)
+    seen = np.random.default_rng(4).random((7, 9)) < 0.5
+    for light in LIGHTS.values():
+        image = relight.shade(gbuffer, camera, light, seen)
+        np.testing.assert_array_equal(
+            image, relight.shade(gbuffer, camera, light, seen.astype(float))
+        )
+        state = relight.start(gbuffer, camera, [light], visibilities=[seen])
+        np.testing.assert_allclose(state.image, image, rtol=1e-12, atol=1e-15)
+        edited = state.edit(0, light, ~seen).add(light, seen)
+        plain = relight.shade(gbuffer, camera, light)
+        np.testing.assert_allclose(edited.image, plain, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("wrong", [255.0, -0.5, np.inf])
+def test_visibilities_out_of_range(wrong):
+    gbuffer, camera = make_gbuffer(3), make_camera("pinhole", 7, 9)
+    light, visibility = LIGHTS["point"], np.full((7, 9), 0.5)
+    visibility[2, 3] = wrong
+    message = r"`shade\(visibility\)` must be in \[0, 1\], got .* at \[2, 3\], one of 1"
+    with pytest.raises(ValueError, match=message):
+        inspect.unwrap(relight.shade)(gbuffer, camera, light, visibility)
+    with pytest.raises(ValueError, match=r"`start\(visibilities=...\)\[0\]` must be in"):
+        relight.start(gbuffer, camera, [light], visibilities=[visibility])
+    # Traced it multiplies as it is.
+    traced = jax.jit(lambda v: relight.shade(gbuffer, camera, light, v))(visibility)
+    plain = np.asarray(relight.shade(gbuffer, camera, light))
+    with np.errstate(invalid="ignore"):
+        expected = np.where(gbuffer.shader[..., None] < 0, 0, plain * visibility[..., None])
+    np.testing.assert_allclose(traced, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [2.0, -0.1, 1.5])
+def test_roughness_out_of_range(wrong):
+    fields = vars(make_gbuffer(5))
+    roughness = np.full((7, 9), 0.5)
+    roughness[1, 2] = wrong
+    message = r"`GBuffer\(roughness\)` must be in \[0, 1\], got .* at \[1, 2\]"
+    with pytest.raises(ValueError, match=message):
+        GBuffer(**fields | {"roughness": roughness})
+    state = relight.start(make_gbuffer(5), make_camera("pinhole", 7, 9), [])
+    with pytest.raises(ValueError, match=r"`paint\(roughness=...\)` must be in \[0, 1\]"):
+        state.paint(np.ones((7, 9), bool), roughness=wrong)
+
+
+def test_a_traced_roughness_above_1_is_1():
+    """The highlight of a roughness of 1 is as bright wherever it is: cosine to the 0."""
+    camera, light = make_camera("pinhole", 7, 9), LIGHTS["directional"]
+
+    @jax.jit
+    def shaded(roughness):
+        fields = vars(make_gbuffer(6)) | {"roughness": jnp.full((7, 9), roughness)}
+        return relight.shade(GBuffer(**fields), camera, light)
+
+    np.testing.assert_array_equal(shaded(2.0), shaded(1.0))
+    slope = jax.jacfwd(shaded)
+    assert np.abs(slope(1.0)).max() > 0.1
+    np.testing.assert_array_equal(slope(2.0), 0)
+
+
+def test_a_traced_cone_out_of_order_is_dark():
+    gbuffer, camera = make_gbuffer(7), make_camera("pinhole", 7, 9)
+    spot = LIGHTS["spot"]
+
+    @jax.jit
+    def shaded(inner, outer):
+        light = SpotLight(spot.position, spot.direction, spot.color, inner, outer)
+        return relight.shade(gbuffer, camera, light)
+
+    assert np.abs(shaded(0.05, 0.7)).max() > 0
+    for inner, outer in ((0.7, 0.05), (0.5, 0.5)):
+        np.testing.assert_array_equal(shaded(inner, outer), 0)
+        for slope in jax.jacrev(shaded, (0, 1))(inner, outer):
+            assert np.isfinite(slope).all()
