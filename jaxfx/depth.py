@@ -14,7 +14,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._checks import check, check_image, is_concrete, parameter
+from jaxfx._arguments import check_camera
+from jaxfx._checks import as_numpy, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
@@ -164,6 +165,7 @@ def from_ray_distance(
     **Gradient:** exact in `distance` and the camera's intrinsics; zero where the depth is
     missing or inf, and in the pose.
     """
+    check_camera("from_ray_distance(camera)", camera)
     values, is_nothing = _numbers_and_sky("from_ray_distance(distance)", distance, None)
     is_known = (values > 0) & ~is_nothing
     known = jnp.where(is_known, values, 1)
@@ -261,7 +263,8 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
 
     What a NumPy mask hides is NaN.
     """
-    array = values if isinstance(values, jax.Array) else np.asanyarray(values)
+    is_array = isinstance(values, jax.Array | np.ma.MaskedArray)
+    array = values if is_array else as_numpy(name, values)
     is_integer = array.dtype.kind in "iu"
     if not is_integer and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"`{name}` must hold real numbers, got {array.dtype}.")

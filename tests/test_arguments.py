@@ -30,6 +30,7 @@ from jaxfx import (
     _arguments,
     blur,
     budget,
+    depth,
     dof,
     fit,
     metrics,
@@ -132,9 +133,12 @@ CALLS = {
     "shadow.pcf": (shadow.pcf, SHADOWED | {"size": 3, "softness": 0.1}),
     "shadow.edge_pcf": (
         shadow.edge_pcf,
-        SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2},
+        SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2, "mask": "screen"},
     ),
-    "shadow.candidates": (shadow.candidates, SHADOWED | {"size": 3, "dilation": 2}),
+    "shadow.candidates": (
+        shadow.candidates,
+        SHADOWED | {"size": 3, "dilation": 2, "mask": "screen"},
+    ),
     "shadow.pcss": (
         shadow.pcss,
         SHADOWED | {"light_camera": FLAT, "size": 3, "light_size": 0.1},
@@ -192,7 +196,8 @@ CALLS = {
     "fit.dof": (
         ft.partial(fit.dof, **QUIET),
         {
-            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "lens": LENS, "gamma": 1.0},
+            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "gamma": 1.0},
+            **{"lens": ThinLens(0.1, 1.0, 60.0)},
             **{"epsilon": 1.0, "threshold": 1.0, "max_coc": 4.0},
         },
     ),
@@ -235,6 +240,20 @@ CALLS = {
         ft.partial(budget.accumulate, lambda eye: IMAGE),
         {"camera": CAMERA, "lens": LENS, "max_error": 0.1},
     ),
+    "depth.clean": (depth.clean, {"depth": DEPTH, "scale": 0.5}),
+    "depth.from_disparity": (
+        depth.from_disparity,
+        {"disparity": DEPTH, "scale": 0.5, "shift": 0.1},
+    ),
+    "depth.from_stereo": (
+        depth.from_stereo,
+        {"disparity": DEPTH, "focal_pixels": 50.0, "baseline": 0.1, "offset": 0.0},
+    ),
+    "depth.from_ray_distance": (
+        depth.from_ray_distance,
+        {"distance": DEPTH, "camera": CAMERA},
+    ),
+    "depth.fill": (depth.fill, {"depth": DEPTH, "image": IMAGE}),
     "ThinLens": (ThinLens, {"aperture": 0.1, "focus_distance": 2.0, "focal_pixels": 30.0}),
     "ThinLens.defocus": (ft.partial(ThinLens.defocus, LENS), {"depth": DEPTH}),
     "ThinLens.circle_of_confusion": (
@@ -332,7 +351,18 @@ WRONG = {
 }
 # Left out, these are something else.
 MAY_BE_NONE = {
-    *("visibility", "sigma", "softness", "normal", "color", "diffuse", "specular", "roughness"),
+    *(
+        "bias",
+        "slope_bias",
+        "visibility",
+        "sigma",
+        "softness",
+        "normal",
+        "color",
+        "diffuse",
+        "specular",
+        "roughness",
+    ),
 }
 
 ARRAYS = [
@@ -348,6 +378,10 @@ def test_what_is_no_array_is_named(name, argument):
     function, arguments = CALLS[name]
     for kind, make in WRONG.items():
         if kind == "None" and argument in MAY_BE_NONE:
+            continue
+        # In `depth` what is masked is missing, and an image may be left out.
+        may_be = kind == "masked" or (kind, argument) == ("None", "image")
+        if name.startswith("depth.") and may_be:
             continue
         wrong = make(arguments[argument])
         with pytest.raises((ValueError, TypeError), match=r"^`") as caught:
@@ -462,6 +496,7 @@ def test_no_function_is_forgotten():
     """Every public function of arrays, and every type of ours, has its good call."""
     host = {"scene", "exr", "io", "tradeoff"}
     records = {"Plan", "Accumulation", "Choice", "Hit", "Receivers", "Candidates", "Lens"}
+    records |= {"Filled"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -328,7 +328,7 @@ GOOD = np.ones((2, 3))
         (lambda: depth.clean(np.ones(3)), r"`clean\(depth\)` must be of shape .* got \(3,\)"),
         (lambda: depth.clean(GOOD[:0]), r"got \(0, 3\)"),
         (lambda: depth.clean(GOOD.astype(str)), r"`clean\(depth\)` must hold real numbers"),
-        (lambda: depth.clean(None), r"`clean\(depth\)` must hold real numbers, got object"),
+        (lambda: depth.clean(None), r"`clean\(depth\)` must be an array, got None"),
         (lambda: depth.clean(GOOD > 0), r"must hold real numbers, got bool"),
         (
             lambda: depth.clean(GOOD, scale=0),
