@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arguments import check_camera
-from jaxfx._checks import as_array, check, check_image, is_concrete, parameter
+from jaxfx._checks import as_numpy, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
@@ -264,7 +264,9 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
     What a NumPy mask hides is NaN.
     """
     is_masked = isinstance(values, np.ma.MaskedArray)
-    array = as_array(name, values.data if is_masked else values)
+    array = values
+    if not isinstance(values, jax.Array):
+        array = as_numpy(name, values.data if is_masked else values)
     is_integer = array.dtype.kind in "iu"
     if not is_integer and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"`{name}` must hold real numbers, got {array.dtype}.")
@@ -273,8 +275,10 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
             f"`{name}` must be of shape (height, width), none of them 0, got {array.shape}. "
             "Batches are made with `jax.vmap`."
         )
-    dtype = jnp.result_type(float) if is_integer else working_dtype(array.dtype)
-    array = array.astype(dtype)
+    dtype = (
+        jnp.result_type(float) if is_integer else working_dtype(array.dtype.newbyteorder("="))
+    )
+    array = jnp.asarray(array.astype(dtype))
     if is_masked:
         array = jnp.where(np.ma.getmaskarray(values), jnp.nan, array)
     return array, is_integer

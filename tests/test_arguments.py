@@ -30,7 +30,7 @@ from jaxfx import (
     _arguments,
     blur,
     budget,
-    depth as depth_of,
+    depth,
     dof,
     fit,
     metrics,
@@ -47,7 +47,6 @@ DEPTH = RNG.uniform(2.0, 2.2, SIZE)
 CAMERA = PinholeCamera.from_fov(0.9, height=SIZE[0], width=SIZE[1])
 FLAT = OrthographicCamera(6.0, [8.0, 6.0], np.eye(4))
 LENS = ThinLens(0.1, 2.1, 30.0)
-WIDE = ThinLens(3.0, 2.1, 30.0)
 LIGHT = PointLight([0.0, -1.0, 0.0], [1.0, 1.0, 1.0])
 NORMAL = np.broadcast_to([0.0, 0, -1], (*SIZE, 3))
 ROUGH = np.full(SIZE, 0.5)
@@ -133,12 +132,12 @@ CALLS = {
     "shadow.prefiltered": (shadow.prefiltered, SHADOWED | {"size": 3}),
     "shadow.pcf": (shadow.pcf, SHADOWED | {"size": 3, "softness": 0.1}),
     "shadow.edge_pcf": (
-        ft.partial(shadow.edge_pcf, mask="screen"),
-        SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2},
+        shadow.edge_pcf,
+        SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2, "mask": "screen"},
     ),
     "shadow.candidates": (
-        ft.partial(shadow.candidates, mask="screen"),
-        SHADOWED | {"size": 3, "dilation": 2},
+        shadow.candidates,
+        SHADOWED | {"size": 3, "dilation": 2, "mask": "screen"},
     ),
     "shadow.pcss": (
         shadow.pcss,
@@ -194,24 +193,11 @@ CALLS = {
         lambda render: inspect.unwrap(relight.capture_normals)(lambda lights: render),
         {"render": IMAGE},
     ),
-    "depth.clean": (depth_of.clean, {"depth": DEPTH, "scale": 2.0}),
-    "depth.fill": (depth_of.fill, {"depth": DEPTH, "image": IMAGE}),
-    "depth.from_disparity": (
-        depth_of.from_disparity,
-        {"disparity": DEPTH, "scale": 2.0, "shift": 0.1},
-    ),
-    "depth.from_stereo": (
-        depth_of.from_stereo,
-        {"disparity": DEPTH, "focal_pixels": 9.0, "baseline": 0.1, "offset": 0.1},
-    ),
-    "depth.from_ray_distance": (
-        depth_of.from_ray_distance,
-        {"distance": DEPTH, "camera": CAMERA},
-    ),
     "fit.dof": (
         ft.partial(fit.dof, **QUIET),
         {
-            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "lens": WIDE, "gamma": 1.0},
+            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "gamma": 1.0},
+            **{"lens": ThinLens(0.1, 1.0, 60.0)},
             **{"epsilon": 1.0, "threshold": 1.0, "max_coc": 4.0},
         },
     ),
@@ -254,6 +240,20 @@ CALLS = {
         ft.partial(budget.accumulate, lambda eye: IMAGE),
         {"camera": CAMERA, "lens": LENS, "max_error": 0.1},
     ),
+    "depth.clean": (depth.clean, {"depth": DEPTH, "scale": 0.5}),
+    "depth.from_disparity": (
+        depth.from_disparity,
+        {"disparity": DEPTH, "scale": 0.5, "shift": 0.1},
+    ),
+    "depth.from_stereo": (
+        depth.from_stereo,
+        {"disparity": DEPTH, "focal_pixels": 50.0, "baseline": 0.1, "offset": 0.0},
+    ),
+    "depth.from_ray_distance": (
+        depth.from_ray_distance,
+        {"distance": DEPTH, "camera": CAMERA},
+    ),
+    "depth.fill": (depth.fill, {"depth": DEPTH, "image": IMAGE}),
     "ThinLens": (ThinLens, {"aperture": 0.1, "focus_distance": 2.0, "focal_pixels": 30.0}),
     "ThinLens.defocus": (ft.partial(ThinLens.defocus, LENS), {"depth": DEPTH}),
     "ThinLens.circle_of_confusion": (
@@ -351,10 +351,19 @@ WRONG = {
 }
 # Left out, these are something else.
 MAY_BE_NONE = {
-    *("visibility", "sigma", "softness", "normal", "color", "diffuse", "specular", "roughness"),
-    *("bias", "slope_bias"),
+    *(
+        "bias",
+        "slope_bias",
+        "visibility",
+        "sigma",
+        "softness",
+        "normal",
+        "color",
+        "diffuse",
+        "specular",
+        "roughness",
+    ),
 }
-GUIDES = {("depth.fill", "image")}
 
 ARRAYS = [
     (name, argument)
@@ -368,10 +377,12 @@ ARRAYS = [
 def test_what_is_no_array_is_named(name, argument):
     function, arguments = CALLS[name]
     for kind, make in WRONG.items():
-        if kind == "None" and (argument in MAY_BE_NONE or (name, argument) in GUIDES):
+        if kind == "None" and argument in MAY_BE_NONE:
             continue
-        if kind == "masked" and name.startswith("depth."):
-            continue  # A mask says there that a depth is missing.
+        # In `depth` what is masked is missing, and an image may be left out.
+        may_be = kind == "masked" or (kind, argument) == ("None", "image")
+        if name.startswith("depth.") and may_be:
+            continue
         wrong = make(arguments[argument])
         with pytest.raises((ValueError, TypeError), match=r"^`") as caught:
             _bare(function)(**arguments | {argument: wrong})
@@ -484,16 +495,8 @@ def test_check_camera_and_check_light():
 def test_no_function_is_forgotten():
     """Every public function of arrays, and every type of ours, has its good call."""
     host = {"scene", "exr", "io", "tradeoff"}
-    records = {
-        "Plan",
-        "Accumulation",
-        "Choice",
-        "Hit",
-        "Receivers",
-        "Candidates",
-        "Filled",
-        "Lens",
-    }
+    records = {"Plan", "Accumulation", "Choice", "Hit", "Receivers", "Candidates", "Lens"}
+    records |= {"Filled"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -210,8 +210,11 @@ def _check_moves(
     """`ValueError` for a lens to be found of which no circle of confusion has a derivative."""
     if not {"aperture", "focus_distance"}.intersection(names):
         return
-    depths = (depth,) if behind is None else (depth, jnp.asarray(behind[1]))
-    circles = jnp.stack([lens.circle_of_confusion(each) for each in depths])
+    depths = [depth]
+    if behind is not None:
+        depths.append(check_depth("dof(behind=...)", behind[1], depth.shape))
+    circles = [jnp.where(d > 0, lens.circle_of_confusion(d), jnp.nan) for d in depths]
+    circles = jnp.stack(circles)
     most = math.inf if max_coc is None else max_coc
     # What is no diameter at all is named by the method.
     if most <= 0 or bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from quick import quick_jit
 
 from jaxfx import FocusPlanes, ThinLens, dof
+from tests.helpers.quick import quick_jit
 
 
 SIZE = (14, 16)
