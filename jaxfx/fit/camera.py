@@ -19,7 +19,7 @@ from jaxfx._numerics import safe_divide
 from jaxfx._progress import Bar
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
-from jaxfx.fit._descent import End, Solver, descend, standard_errors
+from jaxfx.fit._descent import End, Solver, descend, standard_errors, verdict
 from jaxfx.reproject._view import look
 from jaxfx.reproject.warp import check_options, check_source
 
@@ -127,12 +127,12 @@ def camera(
         )
     columns, residual, share = _report(model, end.unknowns)
     # Where nothing is seen the residual is 0, which a solver takes for success.
-    result = end.result if share > 0 else optx.RESULTS.nonlinear_divergence
+    result = end.result if share > 0 else verdict(optx.RESULTS.nonlinear_divergence)
     if throw and result != optx.RESULTS.successful:
         raise RuntimeError(
             f"`camera` found no pose in {len(end.losses)} steps, the mean squared residual "
             f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g} over "
-            f"{100 * float(share):.0f} % of the pixels: {optx.RESULTS[result]} "
+            f"{100 * float(share):.0f} % of the pixels: {result} "
             "`throw=False` returns what was reached."
         )
     errors = standard_errors(columns, residual) / jnp.sqrt(share)

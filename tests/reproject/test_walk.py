@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes.reproject import run
+from jaxfx.reproject._search import search
 from jaxfx.reproject._walk import level_of, pack, unpack
 from tests.cases.reproject import awkward_rays, field
 
@@ -35,3 +36,38 @@ def test_a_bound_on_steps_is_kept_and_said():
     np.testing.assert_array_equal(hit.steps, np.minimum(free.steps, bound))
     within = ~np.asarray(hit.exhausted)
     np.testing.assert_array_equal(hit.mask[within], free.mask[within])
+
+
+@pytest.mark.parametrize("method", ["pyramid", "linear", "relief"])
+def test_rays_from_their_end_meet_what_they_meet_from_their_start(method):
+    """Those that run away are given by where they are at time 0, and begin at -1. (Where the
+    descent begins, on the border of the image, rounding decides.)"""
+    rng = np.random.default_rng(2)
+    depth = jnp.asarray(field((24, 31), rng))
+    depth = jnp.where(depth > 0, depth, jnp.inf)
+    begin, along = (jnp.asarray(v) for v in awkward_rays((24, 31), rng))
+    half = len(begin) // 2  # the other half lies on borders, where rounding decides
+    begin, along = begin[:half], along[:half]
+    runs_away = along[:, 2:] > 0
+    origin = jnp.where(runs_away, begin + along, begin)
+    expected = search(depth, begin, along, method, None)
+    found = search(depth, origin, along, method, None, from_end=True)
+    np.testing.assert_array_equal(found.mask, expected.mask)
+    for name in ("x", "y", "side", "steps"):
+        both = (np.asarray(getattr(each, name))[expected.mask] for each in (found, expected))
+        np.testing.assert_array_equal(*both, name)
+    later = jnp.where(expected.mask, expected.time - runs_away[:, 0].astype(float), 0)
+    np.testing.assert_allclose(found.time, later, atol=1e-12)
+    assert expected.mask.sum() > 30 and not found.time[~found.mask].any()
+
+
+def test_a_ray_that_comes_in_at_an_edge_is_inside_whatever_rounding_says():
+    """Rays from the right edge of the image to where they end, in it, in float32."""
+    rng = np.random.default_rng(3)
+    end = rng.uniform((0, 0, 0), (96, 96, 1), (4000, 3)).astype(np.float32)
+    edge = np.stack([np.full(4000, 96), *rng.uniform((0, -1), (96, 0), (4000, 2)).T], axis=-1)
+    along = end - edge.astype(np.float32)
+    wall = jnp.full((96, 96), -1, jnp.float32)
+    found = search(wall, jnp.asarray(end), jnp.asarray(along), "pyramid", None, from_end=True)
+    assert found.mask.all()
+    assert (np.asarray(found.y) == np.floor(edge[:, 1])).mean() > 0.99
