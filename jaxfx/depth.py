@@ -275,9 +275,7 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
             f"`{name}` must be of shape (height, width), none of them 0, got {array.shape}. "
             "Batches are made with `jax.vmap`."
         )
-    dtype = (
-        jnp.result_type(float) if is_integer else working_dtype(array.dtype.newbyteorder("="))
-    )
+    dtype = jnp.result_type(float) if is_integer else working_dtype(array.dtype)
     array = jnp.asarray(array.astype(dtype))
     if is_masked:
         array = jnp.where(np.ma.getmaskarray(values), jnp.nan, array)
