@@ -47,10 +47,13 @@ def view_rays(
     """The rays of some target pixels, clipped to the source's frustum beyond a depth `unit`."""
     far, eye = _lines(source, target, pixels, unit)
     begin, end = _clip(far, eye, shape)
-    direction = _direction(far, eye, begin, end)
+    length = _length(far, eye, begin, end)
+    # A ray that is none has finite factors: its derivative, 0 times them, is then 0.
+    is_ray = (begin < end) & jnp.isfinite(length)
+    direction = _direction(far, eye) * jnp.where(is_ray, length, 0)[:, None]
     runs_away = jax.lax.stop_gradient(direction[:, 2]) > 0
-    origin = _point(far, eye, jnp.where(runs_away, end, begin))
-    inside = (begin < end) & jnp.isfinite(origin + direction).all(axis=-1)
+    origin = _point(far, eye, jnp.where(is_ray, jnp.where(runs_away, end, begin), 1))
+    inside = is_ray & jnp.isfinite(origin + direction).all(axis=-1)
     origin, direction = (jnp.where(inside[:, None], x, 0) for x in (origin, direction))
     return ViewRays(origin, direction, inside)
 
@@ -108,15 +111,19 @@ def _clip(far: _Point, eye: _Point, shape: tuple[int, int]) -> tuple[Array, Arra
     return begin, end
 
 
-def _direction(far: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, "ray 3"]:
-    """How (x, y, -1 / z) of the source changes from one depth of the target to another."""
-    hold = jax.lax.stop_gradient
+def _direction(far: _Point, eye: _Point) -> Float[Array, "ray 3"]:
+    """Which way (x, y, -1 / z) of the source changes with the depth in the target."""
     (x, y, z), (eye_x, eye_y, eye_z) = far, eye
+    return jnp.stack((x * eye_z - eye_x * z, y * eye_z - eye_y * z, z), axis=-1)
+
+
+def _length(far: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, " ray"]:
+    """How many times `_direction` lies between two depths of the target; held constant."""
+    hold = jax.lax.stop_gradient
+    z, eye_z = hold(far[2]), hold(eye[2])
     inverse = 1 / end
-    start, stop = (hold(v) for v in (z * begin + eye_z, z + inverse * eye_z))
-    length = (1 - begin * inverse) / (jnp.maximum(start, 1) * stop)
-    along = (x * eye_z - eye_x * z, y * eye_z - eye_y * z, z)
-    return jnp.stack(along, axis=-1) * length[:, None]
+    start, stop = z * begin + eye_z, z + inverse * eye_z
+    return (1 - begin * inverse) / (jnp.maximum(start, 1) * stop)
 
 
 def _point(far: _Point, eye: _Point, depth: Array) -> Float[Array, "ray 3"]:

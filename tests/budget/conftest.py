@@ -10,7 +10,7 @@ from jaxfx.budget import _plan
 from tests.helpers.quick import quickly
 
 
-@pytest.fixture(autouse=True, scope="package")
+@pytest.fixture(autouse=True, scope="module")
 def compiled_quickly():
     """Plans of small scenes are made here, and none is asked how fast it is."""
     with quickly():

@@ -146,7 +146,10 @@ def test_a_plan_is_a_pytree_and_its_picture_has_a_gradient():
     ("options", "message"),
     [
         ({"max_error": -1}, r"`dof\(max_error=...\)` must be a number, 0 or positive, got -1"),
-        ({"max_error": 1, "target": "x"}, r"`dof\(target=...\)` must be \"scatter\" or"),
+        (
+            {"max_error": 1, "target": "x"},
+            r"`dof\(target=...\)` must be one of .*'scatter', 'layered'",
+        ),
     ],
 )
 def test_a_wrong_argument_is_refused(options, message):

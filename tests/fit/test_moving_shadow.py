@@ -187,7 +187,7 @@ def test_nothing_shown_and_nothing_known():
 
 FAULTS = {
     "MovingShadow(shadow_map)": {"shadow_map": np.zeros(3)},
-    "MovingShadow(shadow_map) must hold floats": {"shadow_map": np.zeros((3, 3), int)},
+    "MovingShadow(shadow_map) must hold real": {"shadow_map": np.zeros((3, 3), complex)},
     "MovingShadow(size=...)": {"size": 4},
     "MovingShadow(softness=...)": {"softness": 0.0},
 }

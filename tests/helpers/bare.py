@@ -37,7 +37,7 @@ image = rng.uniform(0.1, 1, (*SIZE, 3)).astype(np.float32)
 depth = rng.uniform(2, 3, SIZE).astype(np.float32)
 normal = np.broadcast_to(np.float32([0, 0, -1]), (*SIZE, 3))
 camera = PinholeCamera.from_fov(0.9, height=HEIGHT, width=WIDTH)
-lens = ThinLens.from_camera(camera, aperture=0.2, focus_distance=2.5)
+lens = ThinLens.from_camera(camera, aperture=3.0, focus_distance=2.5)
 lamp = PointLight([0.2, -1.0, 0.1], [3.0, 3.0, 3.0])
 gbuffer = GBuffer(
     image, np.full(SIZE, 1), image, image, image, normal, depth, np.full(SIZE, 0.5, np.float32)

@@ -1,7 +1,7 @@
 import jax
 import jax.numpy as jnp
 
-from tests.helpers.quick import quickly
+from tests.helpers.quick import optimised, quickly
 
 
 def test_quick_programs_are_kept_apart_from_others():
@@ -13,9 +13,7 @@ def test_quick_programs_are_kept_apart_from_others():
         return 2 * x
 
     for _ in range(2):
-        is_quick = False
-        double(jnp.ones(3))
-        is_quick = True
-        with quickly():
-            double(jnp.ones(3))
+        for is_quick, context in ((False, optimised), (True, quickly)):
+            with context():
+                double(jnp.ones(3))
     assert traces == [False, True]

@@ -2,6 +2,7 @@
 
 import inspect
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -90,10 +91,13 @@ def test_bad_scenes_and_cameras(ball, view, monkeypatch):
         of(_view.View, "camera", "scene.depth")
     with pytest.raises(ValueError, match=r"scene\.depth\(scene\)` must be a Scene, got str"):
         inspect.unwrap(scene.depth)("x", view, **SIZE)
-    broken = PinholeCamera(view.intrinsics.at[0, 0].set(np.nan), view.world_from_camera)
+    changed = lambda focal: eqx.tree_at(
+        lambda camera: camera.intrinsics, view, view.intrinsics.at[0, 0].set(focal)
+    )
+    broken = changed(np.nan)
     with pytest.raises(ValueError, match="must be finite"):
         scene.depth(ball, broken, **SIZE)
-    flat = PinholeCamera(view.intrinsics.at[0, 0].set(0), view.world_from_camera)
+    flat = changed(0.0)
     with pytest.raises(ValueError, match="an inverse"):
         scene.depth(ball, flat, **SIZE)
     with pytest.raises(ValueError, match="must be concrete, got a traced camera"):
