@@ -148,7 +148,7 @@ def test_a_plan_is_a_pytree_and_its_picture_has_a_gradient():
         ({"max_error": -1}, r"`dof\(max_error=...\)` must be a number, 0 or positive, got -1"),
         (
             {"max_error": 1, "target": "x"},
-            r"`dof\(target=...\)` must be one of .*'scatter', 'layered'",
+            r"`dof\(target=...\)` must be one of .*'layered'",
         ),
     ],
 )
