@@ -4,11 +4,15 @@ from types import TracebackType
 from typing import final
 
 
+class MissingExtraError(ImportError):
+    """A library is not installed, and the message names the extra that brings it."""
+
+
 @final
 class needs:
     """A context for imports of libraries that the plain installation lacks.
 
-    `with needs("io"): import PIL` raises an `ImportError` that names the extra where the
+    `with needs("io"): import PIL` raises a `MissingExtraError` that names the extra where the
     library is not installed. One that is installed and fails to load keeps its own error.
     """
 
@@ -25,7 +29,7 @@ class needs:
         trace: TracebackType | None,
     ) -> None:
         if isinstance(error, ModuleNotFoundError):
-            raise ImportError(
+            raise MissingExtraError(
                 f"{error}. It comes with an extra: pip install 'jaxfx[{self.extra}]'",
                 name=error.name,
                 path=error.path,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from jaxfx._extras import needs
+from jaxfx._extras import MissingExtraError, needs
 from jaxfx.io._pixels import jpeg_values, png_values
 from jaxfx.scene._part import UnreadableError
 
@@ -59,6 +59,8 @@ def read_image(data: bytes, name: str) -> _Texture:
     try:
         return _colors(data, name)
     except UnreadableError:
+        raise
+    except MissingExtraError:
         raise
     except Exception as error:
         raise UnreadableError(f"the image {name!r} can't be read: {error}") from error

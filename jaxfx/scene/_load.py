@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxfx._extras import needs
+from jaxfx._extras import MissingExtraError, needs
 from jaxfx.scene import _gltf, _obj, _off, _ply, _trimesh
 from jaxfx.scene._gltf_data import is_glb
 from jaxfx.scene._part import UnreadableError, assemble
@@ -56,6 +56,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
         reader = _gltf if is_glb(data) else _READERS.get(file.suffix.lower(), _trimesh)
         with np.errstate(all="ignore"):  # what comes of it is not finite, and found
             parts, ignored = reader.read(file, data)
+    except MissingExtraError:
+        raise
     except Exception as error:
         reason = error if isinstance(error, UnreadableError) else repr(error)
         raise ValueError(
