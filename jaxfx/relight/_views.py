@@ -32,7 +32,7 @@ class Found(NamedTuple):
     """What one cache has where it is asked.
 
     `at` is its flat pixel; `distance` that of its surface, in units of the depth; `detail`
-    the pixels that it spends on a unit of length of the surface, squared.
+    the pixels that it spends on a square of the surface as large as the point's own depth.
     """
 
     seen: Bool[Array, "height width"]
@@ -61,7 +61,8 @@ def points(target: Camera, pixels: Float[Array, "height width 2"], depth: Scalar
     depth = jnp.where(known, depth, 1)
     position = target.unproject(pixels, depth)
     to_camera = target.unproject(pixels, jnp.zeros_like(depth)) - position
-    return Points(known, position, depth, normalize(to_camera))
+    # In lengths of the depth, as below: squares of a far scene's leave float32's range.
+    return Points(known, position, depth, normalize(to_camera / depth[..., None]))
 
 
 def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) -> Found:
@@ -87,19 +88,21 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     seen = filled & (distance <= tolerance) & (along <= _STEEPEST * tolerance * depth)
     seen &= _dot(normal, points.to_camera) > _AWAY
 
-    to_camera = normalize(camera.unproject(centre, jnp.zeros_like(cached)) - points.position)
+    unit = jax.lax.stop_gradient(points.depth)
+    to_camera = camera.unproject(centre, jnp.zeros_like(cached)) - points.position
+    to_camera = normalize(to_camera / unit[..., None])
     # A cache's normal may be no number where it does not see the point.
     frontal = jnp.maximum(_dot(jnp.where(seen[..., None], normal, 0), to_camera), 0.01)
-    detail = frontal * _pixels_per_area(camera, jnp.where(filled, depth, 1))
+    detail = frontal * _pixels_per_area(camera, jnp.where(filled, depth, unit), unit)
     return Found(seen, index, shader, normal, distance, detail)
 
 
-def _pixels_per_area(camera: Camera, depth: Scalars) -> Scalars:
-    """The pixels that a unit square at `depth`, parallel to the image, covers."""
+def _pixels_per_area(camera: Camera, depth: Scalars, side: Scalars) -> Scalars:
+    """The pixels that a square at `depth`, parallel to the image, covers."""
     if isinstance(camera, OrthographicCamera):
-        return jnp.broadcast_to(camera.pixels_per_unit.astype(depth.dtype) ** 2, depth.shape)
+        return (camera.pixels_per_unit.astype(depth.dtype) * side) ** 2
     focal = camera.intrinsics.astype(depth.dtype)
-    return focal[0, 0] * focal[1, 1] / depth**2
+    return focal[0, 0] * focal[1, 1] * (side / depth) ** 2
 
 
 def _dot(a: Vectors, b: Vectors) -> Scalars:

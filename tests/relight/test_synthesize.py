@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx import OrthographicCamera, PinholeCamera, metrics, relight, scene
+from jaxfx import GBuffer, OrthographicCamera, PinholeCamera, metrics, relight, scene
 from tests.cases.relight_views import (
     BLUE,
     CAMERAS,
@@ -231,6 +231,30 @@ def test_what_is_missing_in_a_depth_is_no_hole_to_fill(missing):
     assert int(covered[1][1]) == int(covered[0][1]) > 0
     for name in (*FLOATS, "shader"):
         np.testing.assert_array_equal(*(getattr(each, name) for each in found))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e10, 1e20, 1e36])
+def test_a_scene_of_any_scale_gives_the_same_view(scale):
+    """In float32: positions and depths alike, and what is made of two caches by detail."""
+
+    def eye(x, scale):
+        pose = np.eye(4, dtype=np.float32)
+        pose[0, 3] = x * scale
+        return PinholeCamera.from_fov(0.8, height=8, width=10, world_from_camera=pose)
+
+    color = np.random.default_rng(0).random((8, 10, 3)).astype(np.float32)
+    facing = np.broadcast_to(np.float32([0, 0, -1]), color.shape)
+    found = []
+    for size in (1.0, scale):
+        depth = np.full((8, 10), 4 * size, np.float32)
+        images = color, np.zeros((8, 10), int), color, color, color, facing, depth
+        gbuffer = GBuffer(*images, np.full((8, 10), 0.5, np.float32))
+        eyes = eye(0, size), eye(0.4, size)
+        options = {"depth": depth, "weights": "detail", "tolerance": 0.02}
+        found.append(relight.synthesize([gbuffer] * 2, eyes, eye(0.1, size), **options))
+    (one, coverage), (other, same) = found
+    np.testing.assert_array_equal(same, coverage)
+    np.testing.assert_allclose(other.color, one.color, atol=1e-6)
 
 
 def test_detail_favours_the_camera_that_is_nearer():
