@@ -147,6 +147,8 @@ TARGETS = {
     "moved": camera((0.1, 0.05, 0.1), 0.03),
     "back": camera((0, 0, -0.4)),
     "away": camera((0, 0, 1), np.pi),
+    "beside": camera((3, 0, 0), np.pi / 2),
+    "across": camera((0.5, 0, 1.5), -np.pi / 2),
     "orthographic": OrthographicCamera(
         7.0, [WIDTH / 2, HEIGHT / 2], camera((0.1, 0.05, 0.1), 0.05).world_from_camera
     ),
