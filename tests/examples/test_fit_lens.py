@@ -81,7 +81,7 @@ LINE = "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"
 # What the message must say, so that a user can mend it.
 FAULTS = {
     "missing.obj": "must be a file, got 'missing.obj'",
-    "broken.glb": "must be a mesh that trimesh reads, got 'broken.glb'",
+    "broken.glb": "must be a mesh that can be read, got 'broken.glb'",
     "empty.obj": "must hold at least one triangle, got none",
     "line.obj": "nothing in view",
 }

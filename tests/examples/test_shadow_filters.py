@@ -91,7 +91,7 @@ def test_a_plate_darkens_the_floor(example, tmp_path):
 
 FAULTS = {
     "missing.obj": "must be a file, got 'missing.obj'",
-    "broken.glb": "must be a mesh that trimesh reads, got 'broken.glb'",
+    "broken.glb": "must be a mesh that can be read, got 'broken.glb'",
     "empty.obj": "must hold at least one triangle, got none",
 }
 
