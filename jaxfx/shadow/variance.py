@@ -14,6 +14,9 @@ from jaxfx._sampling import bilinear
 from jaxfx.shadow import _taps
 from jaxfx.shadow.receivers import Receivers
 
+# Times the depth over which the receivers lie, a depth that float32 can still take squares with.
+_FARTHEST = 1e12
+
 
 def variance(
     shadow_map: Num[ArrayLike, "rows columns"],
@@ -35,7 +38,8 @@ def variance(
     **Arguments:**
 
     - `shadow_map`, `receivers`: height width, as in `hard`. An inf, or what is missing, counts
-      as the farthest depth of map and receivers.
+      as the farthest depth of map and receivers; so does what is 1e12 times as far behind the
+      nearest as the receivers.
     - `size`: static; odd, in texels.
     - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, what
       rounding takes: a plane's mean depth, read between texels, is the plane's.
@@ -73,8 +77,11 @@ def _variance(shadow_map, receivers, bias, slope_bias, least, size):
 
     shadow_map = jnp.where(shadow_map > 0, shadow_map.astype(dtype), jnp.inf)
     near, far = _range(shadow_map, threshold, known)
+    # Who lies so far behind all receivers lights them, and takes no digits from their squares.
+    reach = jnp.max(jnp.where(known, threshold, near)) - near
+    far = jnp.minimum(far, near + _FARTHEST * reach)
     scale = jnp.where(far > near, far - near, 1)
-    depth = jnp.where(shadow_map < jnp.inf, shadow_map, far)
+    depth = jnp.minimum(shadow_map, far)
     depth = jnp.pad((depth - near) / scale, size + 1, constant_values=(far - near) / scale)
     moments = _mean(jnp.stack([depth, depth * depth], axis=-1), size)
 

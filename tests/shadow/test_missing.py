@@ -134,3 +134,19 @@ def test_a_slope_far_from_the_origin():
         seen = shadow.receivers(np.full((5, 7), 2, np.float32), *moved, normal=normal)
         slopes.append(seen.slope)
     np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("sky", [1e7, 1e10, 1e20, 1e37])
+def test_a_far_sky_in_a_map_of_moments_changes_nothing_away_from_it(sky):
+    """A variance shadow map in float32, whose unit is that of all depths."""
+    shadow_map = np.full((20, 20), 5, np.float32)
+    shadow_map[6:11, 5:10] = 2
+    x, y = np.meshgrid(np.arange(20) + 0.5, np.arange(20) + 0.5)
+    fields = (field.astype(np.float32) for field in (x, y, np.full_like(x, 5), 0 * x))
+    receivers, visible = shadow.Receivers(*fields), []
+    for far in (5, sky):
+        shadow_map[0] = far
+        found = shadow.variance(shadow_map, receivers, size=3, bias=0.01)
+        visible.append(np.asarray(found)[3:])
+    assert 0.2 < visible[0].std() < 0.5
+    np.testing.assert_allclose(visible[1], visible[0], atol=1e-5)
