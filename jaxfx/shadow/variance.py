@@ -14,7 +14,8 @@ from jaxfx._sampling import bilinear
 from jaxfx.shadow import _taps
 from jaxfx.shadow.receivers import Receivers
 
-# Times the depth over which the receivers lie, a depth that float32 can still take squares with.
+
+# In lengths of the depth over which the receivers lie; of float32 squares hold such a depth.
 _FARTHEST = 1e12
 
 
