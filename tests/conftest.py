@@ -1,4 +1,3 @@
-import contextlib
 import gc
 from pathlib import Path
 
@@ -28,21 +27,40 @@ def pytest_addoption(parser):
     )
 
 
-def pytest_collection_modifyitems(config, items):
-    """Leave out what only `--full` runs, unless its file or its marker was asked for."""
-    if config.getoption("full") or config.getoption("markexpr"):
-        return
+def _asked(config):
+    """Whether a path belongs to this run: `--full` and `-m` take all, and so does its name."""
     root = config.invocation_params.dir
-    asked = {(root / argument.partition("::")[0]).resolve() for argument in config.args}
+    named = {(root / argument.partition("::")[0]).resolve() for argument in config.args}
+    everything = config.getoption("full") or config.getoption("markexpr")
 
-    def is_quick(item):
-        in_folder = item.path.parent.name in FULL_FOLDERS
-        return not (in_folder or item.get_closest_marker("full")) or item.path in asked
+    def is_asked(path):
+        folder = path if path.is_dir() else path.parent
+        in_folder = folder.name in FULL_FOLDERS and folder in named
+        return everything or path in named or in_folder
 
-    left_out = [item for item in items if not is_quick(item)]
+    return is_asked
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Import no folder that only `--full` runs, unless it or a file in it was named."""
+    if collection_path.name not in FULL_FOLDERS:
+        return None
+    is_asked = _asked(config)
+    return not any(map(is_asked, [collection_path, *collection_path.glob("*.py")])) or None
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out what only `--full` runs, unless its folder, its file or a marker was named."""
+    is_asked = _asked(config)
+    left_out = {
+        item
+        for item in items
+        if item.get_closest_marker("full") or item.path.parent.name in FULL_FOLDERS
+        if not is_asked(item.path)
+    }
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if is_quick(item)]
+        items[:] = [item for item in items if item not in left_out]
 
 
 @pytest.fixture(scope="session")
@@ -61,14 +79,7 @@ def forget_programs():
 
 
 @pytest.fixture(autouse=True, scope="session")
-def quick_by_default(is_full):
-    """Compile with little optimisation in the quick form, as users do in the full one."""
-    with contextlib.nullcontext() if is_full else compiling.quickly():
-        yield
-
-
-@pytest.fixture
-def quick():
+def quick_by_default():
     """Compile with little optimisation, in half to three quarters of the time.
 
     `tests/test_transforms.py` compares every function with and without it.
@@ -79,6 +90,6 @@ def quick():
 
 @pytest.fixture
 def optimised():
-    """Compile with all optimisation: for tests of what a program costs."""
+    """Compile with all optimisation, as users do: for costs and for published figures."""
     with compiling.optimised():
         yield

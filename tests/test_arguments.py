@@ -392,10 +392,14 @@ def test_what_is_no_array_is_named(name, argument):
 
 
 # The others measure and search: they give their arguments to the effects.
-DETERMINED = [each for each in ARRAYS if not each[0].startswith(("fit.", "budget."))]
+# A fit or a plan compiles its programs at every call.
+SLOW = ("fit.", "budget.")
+
+DETERMINED = [each for each in ARRAYS if not each[0].startswith(SLOW)]
 
 
 @pytest.mark.parametrize(("name", "argument"), DETERMINED)
+@pytest.mark.full
 def test_byte_orders_and_lists_are_read(name, argument):
     """What holds the same numbers gives the same, to the last digit."""
     function, arguments = CALLS[name]
@@ -419,7 +423,7 @@ COUNTS = [
 
 
 @pytest.mark.parametrize(("name", "argument"), COUNTS)
-def test_static_numbers(name, argument):
+def test_static_numbers_are_whole_numbers_or_refused(name, argument):
     function, arguments = CALLS[name]
     call = _bare(function)
     for wrong in (True, np.True_, "3", [3], 3j, np.array([3, 3])):
@@ -428,7 +432,13 @@ def test_static_numbers(name, argument):
     if argument in STATIC:
         with pytest.raises(ValueError, match=rf"^`[\w.]*\(.*{argument}.*\)` must .*, got"):
             call(**arguments | {argument: 2.5})
-    given = arguments[argument]
+
+
+@pytest.mark.parametrize(("name", "argument"), COUNTS)
+@pytest.mark.full
+def test_static_numbers_of_any_kind(name, argument):
+    function, arguments = CALLS[name]
+    call, given = _bare(function), arguments[argument]
     kinds = (np.int64, np.uint8) if argument in STATIC else (np.float32, np.float64)
     for kind in (*kinds, np.asarray, jnp.asarray):
         call(**arguments | {argument: kind(given)})

@@ -10,6 +10,7 @@ import pytest
 import scipy.ndimage
 
 from jaxfx import blur
+from tests.helpers.forms import first
 
 
 # Rakos 2010: row 12 of Pascal's triangle without its outer two, and the linear samples of it.
@@ -158,8 +159,8 @@ def test_scipys_gaussian():
     np.testing.assert_allclose(out[..., 0], expected, rtol=1e-13)
 
 
-@pytest.mark.parametrize("passes", [1, 4])
-@pytest.mark.parametrize("sigma", [3.0, 10.0, np.float32(10), jnp.asarray(10.0)])
+@first("passes", [1, 4])
+@first("sigma", [3.0, 10.0, np.float32(10), jnp.asarray(10.0)])
 def test_a_sigma_alone_sets_the_taps(sigma, passes):
     """As wide as asked for, but for what lies beyond 4 standard deviations."""
     expected = float(sigma)
@@ -204,7 +205,7 @@ def test_a_sigma_that_the_taps_do_not_hold_falls_short_as_documented():
         assert spread_of(1e3, 9, passes) == pytest.approx((passes * 80 / 12) ** 0.5, rel=1e-4)
 
 
-@pytest.mark.parametrize("sampling", ["discrete", "linear"])
+@first("sampling", ["discrete", "linear"])
 def test_sigma_0_is_the_identity_with_a_gradient_of_0(sampling):
     """In float32; in float64, in `tests/stability`."""
     image = jnp.asarray(picture(12, 14, dtype=np.float32))

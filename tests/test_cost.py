@@ -41,6 +41,7 @@ def shadowed():
     ("effect", "argument", "most"),
     [(blended, 0, 4), (shadowed, 0, 8), (shadowed, 1, 8), (shadowed, 2, 8)],
 )
+@pytest.mark.full
 def test_a_gradient_takes_a_few_times_the_operations_of_its_picture(effect, argument, most):
     function, arguments = effect()
     loss = lambda *arguments: jnp.sum(function(*arguments) ** 2)

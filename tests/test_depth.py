@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, depth
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 NAN, INF = np.nan, np.inf
 HOLES = np.array([[0.0, -0.0, -3.0, -INF, NAN, INF, 2.0]])
@@ -229,6 +228,7 @@ def scene(size=(48, 64)):
     return is_disc, values, image + rng.normal(0, 0.01, image.shape)
 
 
+@pytest.mark.full
 def test_the_image_guides():
     """A hole over the edge of the disc ends up on both sides of it, as the image shows."""
     is_disc, values, image = scene()
@@ -285,7 +285,7 @@ def test_a_sky_alone():
         assert np.isinf(depth.fill(values, method=method).depth).all()
 
 
-@pytest.mark.parametrize("method", ["rows", "guided"])
+@first("method", ["rows", "guided"])
 def test_a_slope_goes_to_the_depth_that_is_copied(method):
     rng = np.random.default_rng(3)
     values = rng.uniform(1, 9, (7, 8))
@@ -307,7 +307,7 @@ def test_a_slope_goes_to_the_depth_that_is_copied(method):
     np.testing.assert_array_equal(guide_slope, np.zeros_like(image))
 
 
-@pytest.mark.parametrize("method", ["rows", "guided"])
+@first("method", ["rows", "guided"])
 def test_holes_under_jit_and_vmap(method):
     rng = np.random.default_rng(4)
     holed = np.where(rng.uniform(size=(3, 9, 8)) < 0.5, NAN, rng.uniform(1, 9, (3, 9, 8)))

@@ -7,9 +7,7 @@ import pytest
 import scipy.ndimage
 
 from jaxfx import _filter
-
-
-pytestmark = pytest.mark.usefixtures("quick")
+from tests.helpers.forms import first
 
 
 def along(size, weights):
@@ -17,9 +15,10 @@ def along(size, weights):
     return scipy.ndimage.correlate1d(np.eye(size), weights, axis=0, mode="nearest")
 
 
-@pytest.mark.parametrize(
+@first(
     ("size", "taps"),
     [((11, 12), 5), ((26, 23), 19), ((7, 20), 9), ((20, 7), 9), ((1, 30), 9), ((9, 9), 9)],
+    2,
 )
 def test_values_and_transpose_are_the_matrices(size, taps):
     rng = np.random.default_rng(taps)

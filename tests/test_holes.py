@@ -9,8 +9,6 @@ import pytest
 from jaxfx import _holes
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 NAN = np.nan
 
 

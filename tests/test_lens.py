@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxfx import FocusPlanes, Lens, OrthographicCamera, PinholeCamera, ThinLens
+from tests.helpers.forms import first
 from tests.helpers.quick import check_slopes
 
 
@@ -104,7 +105,7 @@ def test_integers_lists_and_other_byte_orders_are_depths(lens, method):
     assert getattr(lens, method)(3).shape == ()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@first("method", METHODS)
 @pytest.mark.parametrize(
     "lens", [ThinLens(50.0, 2000.0, 1500.0), FocusPlanes(100.0, 2000.0, 60000.0, 7.3)]
 )
@@ -220,7 +221,7 @@ def test_focus_planes_are_piecewise_linear():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("lens", [LENS, PLANES])
+@first("lens", [LENS, PLANES])
 def test_gradients_at_smooth_points(lens, method):
     call = lambda lens, depth: getattr(lens, method)(depth)
     depth = jnp.array([0.4, 1.3, 1.9, 2.2, 4.1, 7.0])
@@ -248,7 +249,7 @@ def slope_from(function, x, step):
     return (function(x + step) - function(x)) / step
 
 
-@pytest.mark.parametrize("lens", [LENS, PLANES])
+@first("lens", [LENS, PLANES])
 def test_circle_of_confusion_at_its_kink(lens):
     """On the focus plane: the derivative from behind it."""
     for transform in (jax.grad, jax.jacfwd):

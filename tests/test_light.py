@@ -46,6 +46,7 @@ def test_types_of_numbers(kind, fields):
 
 
 @pytest.mark.parametrize(("kind", "fields"), LIGHTS.items())
+@pytest.mark.full
 def test_transforms(kind, fields):
     """Made, batched and differentiated inside them."""
 

@@ -3,10 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfx._linear import linear
 
 
+@pytest.mark.full
 def test_each_program_is_run_where_it_is_asked_for():
     """`push`, `pull` and `plain` are of three matrices, which tells them apart."""
     matrices = (jnp.asarray(m) for m in np.random.default_rng(0).normal(size=(3, 3, 2)))

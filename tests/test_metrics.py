@@ -12,7 +12,8 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from jaxfx import metrics
-from tests.helpers.quick import check_slopes, quick_jit
+from tests.helpers.forms import first
+from tests.helpers.quick import check_slopes
 
 
 SKIMAGE = {
@@ -93,7 +94,7 @@ def test_ssim_equals_scikit_image(rng, pair, dtype, window):
     np.testing.assert_allclose(value, oracle(image, reference, window), rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("window", WINDOWS)
+@first("window", WINDOWS)
 @hyp.given(st.integers(11, 26), st.integers(11, 26), st.integers(1, 4), st.integers(0, 2**32))
 @hyp.settings(max_examples=5, deadline=None)
 def test_ssim_of_any_size(window, height, width, channels, seed):
@@ -151,7 +152,7 @@ def test_equal_images(rng, dtype):
     for function, best in ((metrics.psnr, np.inf), (metrics.ssim, 1)):
         assert function(image, image) == best
 
-        @quick_jit
+        @jax.jit
         def both_modes(image, reference, function=function):
             along = jax.jvp(lambda a: function(a, reference), (image,), (image,))[1]
             return jax.grad(function)(image, reference), along
@@ -168,7 +169,7 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@first("call", CALLS.values(), 2, ids=CALLS)
 def test_gradients(rng, call):
     """In the images and the range, both modes, against finite differences; twice too."""
     image, reference = rng.random((2, 13, 13, 2))
@@ -178,20 +179,21 @@ def test_gradients(rng, call):
     check_slopes(jax.grad(lambda x: function(x, reference, 1.3)), (image,), **tolerances)
 
 
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@first("call", CALLS.values(), ids=CALLS)
 def test_gradient_of_every_pixel(rng, call):
     image, reference = rng.random((2, 13, 13, 1))
-    both_modes = quick_jit(lambda *at: (jax.grad(call)(*at), jax.jacfwd(call)(*at)))
+    both_modes = jax.jit(lambda *at: (jax.grad(call)(*at), jax.jacfwd(call)(*at)))
     gradient, forward = both_modes(jnp.asarray(image), reference)
     step = 1e-5
     changes = step * np.eye(image.size).reshape(image.size, *image.shape)
-    batch = quick_jit(jax.vmap(lambda change: call(image + change, reference)))
+    batch = jax.jit(jax.vmap(lambda change: call(image + change, reference)))
     expected = (batch(changes) - batch(-changes)) / (2 * step)
     np.testing.assert_allclose(gradient.ravel(), expected, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(forward, gradient, rtol=1e-10, atol=1e-14)
 
 
 @pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.full
 def test_ssim_gradient_in_float32(rng, window):
     image, reference = noise(rng)
     slope = jax.grad(partial(metrics.ssim, window=window))
@@ -202,13 +204,14 @@ def test_ssim_gradient_in_float32(rng, window):
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@pytest.mark.full
 def test_transforms(rng, call):
     images, references = rng.random((2, 3, 13, 13, 2))
     single = [
         call(image, reference) for image, reference in zip(images, references, strict=True)
     ]
 
-    @quick_jit
+    @jax.jit
     def transformed(images, references):
         slope = jax.grad(call)
         batches = jax.vmap(call)(images, references), jax.vmap(slope)(images, references)

@@ -1,11 +1,11 @@
 """Pyramids of any size, against the definition."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfx._pyramid import maximum_pyramid, minimum_pyramid
-from tests.helpers.quick import quick_jit
 
 
 SIZES = [(1, 1), (1, 2), (2, 3), (5, 1), (17, 5), (61, 64), (64, 257)]
@@ -18,7 +18,7 @@ SIZES = [(1, 1), (1, 2), (2, 3), (5, 1), (17, 5), (61, 64), (64, 257)]
 def test_each_texel_is_the_extreme_of_what_it_covers(pyramid, extreme, size):
     depth = np.random.default_rng(0).normal(size=size)
 
-    @quick_jit
+    @jax.jit
     def levels(depth):
         made = pyramid(depth)
         return made, [made.level(k) for k in range(len(made.shapes))]

@@ -10,9 +10,6 @@ from jaxfx import PinholeCamera
 from jaxfx._sampling import bilinear, nearest, pixel_centers
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 5), (4, 2)])
 def test_pixel_centers(height, width):
     centers = pixel_centers(height, width)

@@ -7,14 +7,6 @@ import numpy as np
 import pytest
 
 from jaxfx.budget import _plan
-from tests.helpers.quick import quickly
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compiled_quickly():
-    """Plans of small scenes are made here, and none is asked how fast it is."""
-    with quickly():
-        yield
 
 
 class Promises(list):

@@ -22,6 +22,7 @@ def waves(rng):
     return lambda eye: picture(eye)[:, None, None], mean[:, None, None]
 
 
+@pytest.mark.full
 def test_passes_are_within_the_error_that_their_variance_bounds():
     rng, slack = np.random.default_rng(0), []
     for _ in range(12):

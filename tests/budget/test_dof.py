@@ -81,6 +81,7 @@ def test_no_error_allowed_is_the_effect_itself():
     np.testing.assert_array_equal(plan(*data), dof.scatter(*data, max_coc=10.0))
 
 
+@pytest.mark.full
 def test_a_plan_may_approach_the_layered_effect():
     data = scene(np.random.default_rng(5), 9.9)
     full = dof.layered(*data, max_coc=10.0)
@@ -167,6 +168,7 @@ def test_a_plan_is_made_outside_of_transforms():
 
 
 @pytest.mark.parametrize("own", [False, True])
+@pytest.mark.full
 def test_missing_depths_and_lenses_of_ones_own(own):
     image, depth, thin = scene(np.random.default_rng(5), 9.0, (24, 30))
     depth = depth.at[3:7, 4:9].set(0).at[20, 20].set(np.nan)

@@ -65,6 +65,7 @@ def test_a_plan_names_the_lights_that_it_drops():
     assert "lights 1, 3, " in str(budget.relight(cache, camera, lights, max_error=1e-3))
 
 
+@pytest.mark.full
 def test_lights_are_computed_where_they_are_needed():
     """Against the picture of each light times the pixels that it is for."""
     rng = np.random.default_rng(2)
@@ -88,6 +89,7 @@ def test_lights_are_computed_where_they_are_needed():
     np.testing.assert_allclose(jax.grad(total)(1.0), picture.sum(), rtol=1e-9)
 
 
+@pytest.mark.full
 def test_a_light_that_reaches_a_corner_is_computed_there_alone():
     size = (24, 32)
     flat = lambda *value: np.broadcast_to(np.array(value, float), (*size, len(value)))
@@ -103,6 +105,7 @@ def test_a_light_that_reaches_a_corner_is_computed_there_alone():
     assert "light 1 in 92% of their tiles" in str(plan)
 
 
+@pytest.mark.full
 def test_shadows_that_take_nothing_away_need_no_map():
     rng = np.random.default_rng(5)
     cache, camera, lights = scene(rng)
@@ -114,6 +117,7 @@ def test_shadows_that_take_nothing_away_need_no_map():
     assert np.sqrt(np.mean((without - full) ** 2)) <= 1e-4
 
 
+@pytest.mark.full
 def test_lights_in_one_place_become_one():
     """Their sum is exact there: and so are ambient ones', anywhere."""
     cache, camera, (near, far, *_) = scene(np.random.default_rng(4))

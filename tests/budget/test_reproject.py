@@ -53,6 +53,7 @@ def test_some_plans_leave_a_source_out_and_some_a_few_tiles_of_it(plans):
     assert any("steps of a ray after" in text for text in texts)
 
 
+@pytest.mark.full
 def test_a_plan_knows_what_the_effect_knows(later_is_quicker):
     """A source that alone sees some pixels is drawn there, however much error is allowed."""
     images, depths, cameras, _ = scene(np.random.default_rng(0))
@@ -64,6 +65,7 @@ def test_a_plan_knows_what_the_effect_knows(later_is_quicker):
     np.testing.assert_array_equal(plan(*data)[1], known)
 
 
+@pytest.mark.full
 def test_rays_that_show_nothing_are_cut_short(later_is_quicker):
     """Between posts they go on, out of the picture; and nobody misses what they would show."""
     posts = np.where(np.arange(SIZE[1]) % 6 < 1, 2.0, 6.0) * np.ones(SIZE)
@@ -88,6 +90,7 @@ def test_rays_that_show_nothing_are_cut_short(later_is_quicker):
     np.testing.assert_allclose(pulled, exact, atol=1e-12)
 
 
+@pytest.mark.full
 def test_steps_that_show_something_are_taken(later_is_quicker):
     """Though the error allowed is more than they make: without them pixels would be lost."""
     ((image, _), (depth, _), (camera, _), _) = scene(np.random.default_rng(2))

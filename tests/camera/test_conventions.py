@@ -11,8 +11,6 @@ from jax.test_util import check_grads
 from jaxfx import PinholeCamera
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 HEIGHT, WIDTH = 48, 64
 
 
@@ -185,6 +183,7 @@ def test_opengl():
     assert_sees(camera, np.stack([x, HEIGHT - from_below], axis=1), clip[:, 3], world)
 
 
+@pytest.mark.full
 def test_gradients():
     pose, _, _ = matrix_world()
     size = {"height": HEIGHT, "width": WIDTH}

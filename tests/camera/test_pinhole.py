@@ -12,9 +12,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxfx import OrthographicCamera, PinholeCamera
-
-
-pytestmark = pytest.mark.usefixtures("quick")
+from tests.helpers.forms import first
 
 
 def rigid(rng):
@@ -223,7 +221,7 @@ def test_the_focus_plane_stays_within_1e_12():
     np.testing.assert_allclose(still, pixels, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("make", CAMERAS)
+@first("make", CAMERAS)
 def test_gradients_of_project_and_unproject(rng, make):
     """In every field, the points, the pixels and the depth, both modes."""
     camera = make(rng)
@@ -250,7 +248,7 @@ def test_a_batch_of_cameras(rng, make):
         np.testing.assert_allclose(depth[i], expected_depth, rtol=1e-11)
 
 
-@pytest.mark.parametrize("make", CAMERAS)
+@first("make", CAMERAS)
 def test_rays_and_points(rng, make):
     camera, size = make(rng), (3, 5)
     origins, directions = camera.rays(height=np.int64(3), width=5)
@@ -280,7 +278,7 @@ def test_rays_and_points(rng, make):
     check_grads(rays_of, (camera,), order=1, rtol=1e-4)
 
 
-@pytest.mark.parametrize("make", CAMERAS)
+@first("make", CAMERAS)
 def test_types_of_what_is_given(rng, make):
     """Integers and lists are numbers; halves are computed with as floats."""
     camera = make(rng)
@@ -365,7 +363,7 @@ def test_intrinsics_that_are_none(intrinsics):
         PinholeCamera(intrinsics, np.eye(4))
 
 
-@pytest.mark.parametrize("make", CAMERAS)
+@first("make", CAMERAS)
 def test_a_batch_of_cameras_without_vmap(rng, make):
     cameras = jax.tree.map(lambda *x: jnp.stack(x), make(rng), make(rng), make(rng))
     calls = {

@@ -12,9 +12,8 @@ import scipy.special
 from jaxfx import FocusPlanes, PinholeCamera, ThinLens, dof
 from jaxfx._sampling import pixel_centers
 from jaxfx.dof.accumulate import lens_samples
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 HEIGHT, WIDTH = 8, 24
 FOCUS = 2.0
@@ -61,7 +60,8 @@ def disc_left_of(t):
     return 0.5 + (t * np.sqrt(1 - t * t) + np.arcsin(t)) / np.pi
 
 
-@pytest.mark.parametrize("depth", [1.0, 3.0])
+@first("depth", [1.0, 3.0])
+@pytest.mark.full
 def test_an_edge_becomes_the_area_of_the_disc(depth):
     samples = 256
     result = accumulate(plane(depth, edge), samples=samples, jitter=False).image
@@ -107,6 +107,7 @@ def test_a_constant_stays_constant():
     assert result.convergence < 1e-15
 
 
+@pytest.mark.full
 def test_jitter_antialiases_by_a_box_of_one_pixel():
     # On the focus plane, an edge that cuts the pixels of column 12 at three quarters.
     focal = float(LENS.focal_pixels)
@@ -119,6 +120,7 @@ def test_jitter_antialiases_by_a_box_of_one_pixel():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.full
 def test_one_bad_pixel_spoils_neither_the_convergence_nor_a_derivative(bad):
     good = plane(3.0, waves)
     clear = np.ones((HEIGHT, WIDTH, 1), bool)
@@ -138,6 +140,7 @@ def test_one_bad_pixel_spoils_neither_the_convergence_nor_a_derivative(bad):
     assert np.isnan(nowhere.convergence)
 
 
+@pytest.mark.full
 def test_convergence_is_that_of_half_the_passes_and_tells_the_error():
     render = plane(5.0, waves)
     truth = blurred_waves(5.0)
@@ -179,6 +182,7 @@ def test_seeds_differ_and_repeat():
     assert np.abs(one - other).max() > 1e-4
 
 
+@pytest.mark.full
 def test_gradients_pass_through_the_renderer_in_both_modes():
     render = plane(5.0, waves)
     weight = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 1))
@@ -213,7 +217,7 @@ def test_faults_name_the_argument():
         call(lambda eye: jnp.zeros(next(sizes)), CAMERA, LENS, samples=2, progress=False)
 
 
-@pytest.mark.parametrize(
+@first(
     ("kind", "value", "result"),
     [
         (np.uint8, 200, np.float64),

@@ -9,6 +9,7 @@ from scipy import ndimage
 from jaxfx import FocusPlanes, ThinLens, dof
 from jaxfx.dof._discs import vogel
 from jaxfx.dof.blend import taps_kernel
+from tests.helpers.forms import first
 
 
 def test_equals_two_blurs_and_a_lerp():
@@ -58,8 +59,8 @@ def test_a_bad_pixel_spoils_what_its_taps_reach():
     assert not spoiled[:, 25:].any()
 
 
-@pytest.mark.parametrize("shape", [(1, 5), (4, 1), (2, 3), (9, 8)])
-def test_its_transpose_is_that_of_what_it_does(shape, quick):
+@first("shape", [(1, 5), (4, 1), (2, 3), (9, 8)])
+def test_its_transpose_is_that_of_what_it_does(shape):
     """The frame's border, which is repeated as far as taps read, gets back what they read."""
     rng = np.random.default_rng(0)
     image, bar = rng.random((2, *shape, 1))

@@ -13,8 +13,6 @@ from jaxfx import FocusPlanes, ThinLens, dof, metrics
 from jaxfx.dof.accumulate import lens_samples
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 LENSES = [ThinLens(0.1, 2.5, 60.0), FocusPlanes(1.0, 2.5, 6.0, 5.0)]
 
 
@@ -132,6 +130,7 @@ def layers(side, samples=4096):
     return colors[first], depths[first], lens, truth / samples
 
 
+@pytest.mark.full
 def test_beats_scatter_on_an_ordered_scene():
     """At any gamma and epsilon; and by far, where nothing that the lens sees is hidden."""
     image, depth, lens, truth = layers(40)

@@ -11,8 +11,6 @@ import pytest
 from jaxfx import FocusPlanes, ThinLens, dof
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 METHODS = [dof.anisotropic_diffusion, dof.implicit_diffusion]
 each_method = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.__name__)
 LENSES = [ThinLens(0.3, 3.0, 60.0), FocusPlanes(1.0, 3.0, 8.0, 9.0)]
@@ -131,6 +129,7 @@ def test_implicit_keeps_its_digits_at_any_radius():
 
 
 @pytest.mark.usefixtures("optimised")
+@pytest.mark.full
 def test_explicit_memory_of_a_gradient_grows_with_the_root_of_the_steps():
     image, depth = scene(0, 32, 32)
 

@@ -11,9 +11,7 @@ from scipy import ndimage
 from jaxfx import FocusPlanes, ThinLens, dof
 from jaxfx.dof._discs import vogel
 from jaxfx.dof.gather import low_resolution
-
-
-pytestmark = pytest.mark.usefixtures("quick")
+from tests.helpers.forms import first
 
 
 # Of the paper, once more: these are what it prints.
@@ -81,7 +79,7 @@ def loop(image, depth, lens, taps, softness):
     return result
 
 
-@pytest.mark.parametrize(("taps", "softness"), [(None, 0.0), (None, 1.5), (19, 1.5)])
+@first(("taps", "softness"), [(None, 0.0), (None, 1.5), (19, 1.5)], 2)
 @pytest.mark.parametrize("lens", [ThinLens(0.3, 3.0, 60.0), PLANES], ids=["thin", "planes"])
 def test_equals_the_loop(taps, softness, lens):
     image, depth = scene()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxfx import FocusPlanes, ThinLens, dof
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
 
 SIZE = (14, 16)
@@ -34,6 +34,11 @@ METHODS = {
     "anisotropic_diffusion": dof.anisotropic_diffusion,
     "implicit_diffusion": dof.implicit_diffusion,
 }
+# All kernels of a function read their arguments in one place: the quick form takes one of them.
+KERNELS = {"scatter shift", "scatter tiles", "scatter spans", "depth_sorted all", "gather 13"}
+EACH = [
+    pytest.param(name, marks=pytest.mark.full if name in KERNELS else ()) for name in METHODS
+]
 # In these a pixel without a circle shows what reaches it; in the others its own colour.
 SPREADING = {name for name in METHODS if name.split()[0] in ("scatter", "layered", "separable")}
 SPREADING |= {"depth_sorted", "depth_sorted all"}
@@ -49,7 +54,7 @@ def blurred(name):
 @ft.cache
 def drawn(name):
     """The same, compiled."""
-    return quick_jit(blurred(name))
+    return jax.jit(blurred(name))
 
 
 def scene(seed=0, size=SIZE):
@@ -71,7 +76,7 @@ OTHERS = np.ones(SIZE, bool)
 OTHERS[HOLE] = False
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", EACH)
 def test_every_missing_depth_is_the_same(name):
     first, *others = (np.asarray(drawn(name)(*with_hole(value), LENS)) for value in MISSING)
     assert np.isfinite(first).all()
@@ -81,7 +86,7 @@ def test_every_missing_depth_is_the_same(name):
     np.testing.assert_allclose(concrete, first, rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_missing_pixel_has_no_share_in_others(name):
     plain = np.asarray(drawn(name)(*with_hole(), LENS))
     bright = np.asarray(drawn(name)(*with_hole(color=1e4), LENS))
@@ -92,7 +97,7 @@ def test_a_missing_pixel_has_no_share_in_others(name):
     np.testing.assert_allclose(lost[OTHERS], plain[OTHERS], rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@first("name", METHODS)
 def test_the_effect_of_a_hole_is_local(name):
     size = (40, 44)
     image, depth = scene(size=size)
@@ -107,7 +112,7 @@ def test_the_effect_of_a_hole_is_local(name):
         assert moved[distance > np.sqrt(2) * FAR].max() < 1e-12
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", EACH)
 @pytest.mark.parametrize("depth", [1.2, 6.0])
 def test_a_hole_in_an_even_picture(name, depth):
     """All is of one colour and one depth out of focus, but for one pixel that has none."""
@@ -119,7 +124,7 @@ def test_a_hole_in_an_even_picture(name, depth):
     np.testing.assert_allclose(found[HOLE], own, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_hole_that_nothing_reaches_keeps_its_colour(name):
     image, depth = scene()
     depth[:] = LENS.focus_distance
@@ -155,6 +160,7 @@ def test_scatter_of_holes_is_the_mean_of_all_others():
 
 
 @pytest.mark.parametrize("kernel", ["shift", "tiles", "spans"])
+@pytest.mark.full
 def test_kernels_of_scatter_agree_about_holes(kernel):
     image, depth = scene(3, (30, 34))
     depth[np.random.default_rng(4).random(depth.shape) < 0.2] = 0
@@ -166,14 +172,14 @@ def test_kernels_of_scatter_agree_about_holes(kernel):
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("value", [0.0, np.nan])
+@first("name", METHODS)
+@first("value", [0.0, np.nan])
 def test_derivatives_beside_a_hole(name, value):
     """Forward and reverse against differences; nothing passes through a missing depth."""
     image, depth = (jnp.asarray(x) for x in with_hole(value))
     weight = jnp.asarray(np.random.default_rng(5).normal(size=(*SIZE, 3)))
     loss = lambda image, depth, lens: jnp.sum(weight * blurred(name)(image, depth, lens))
-    by_image, by_depth, by_lens = quick_jit(jax.grad(loss, (0, 1, 2)))(image, depth, LENS)
+    by_image, by_depth, by_lens = jax.jit(jax.grad(loss, (0, 1, 2)))(image, depth, LENS)
     leaves = jax.tree.leaves((by_image, by_depth, by_lens))
     assert all(np.isfinite(leaf).all() for leaf in leaves)
     assert by_depth[HOLE] == 0
@@ -188,7 +194,7 @@ def test_derivatives_beside_a_hole(name, value):
     reverse = dot((by_image, by_depth, by_lens), along)
     arguments = (image, depth, LENS)
     tangents = jax.tree.map(jnp.asarray, along)
-    _, forward = quick_jit(lambda x, v: jax.jvp(loss, x, v))(arguments, tangents)
+    _, forward = jax.jit(lambda x, v: jax.jvp(loss, x, v))(arguments, tangents)
     assert float(forward) == pytest.approx(reverse, rel=1e-8)
 
     def moved(step):
@@ -199,19 +205,20 @@ def test_derivatives_beside_a_hole(name, value):
     assert float(forward) == pytest.approx(float(quotient), rel=1e-4, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@first("name", METHODS)
 def test_a_batch_with_a_hole_in_one(name):
     (one, clear), (other, holed) = scene(), with_hole(0.0)
     images, depths = np.stack([one, other]), np.stack([clear, holed])
-    batch = quick_jit(jax.vmap(blurred(name), (0, 0, None)))(images, depths, LENS)
+    batch = jax.jit(jax.vmap(blurred(name), (0, 0, None)))(images, depths, LENS)
     for i in (0, 1):
         np.testing.assert_allclose(batch[i], drawn(name)(images[i], depths[i], LENS), rtol=1e-8)
 
 
+@pytest.mark.full
 def test_the_second_layer_may_have_holes():
     image, depth = scene()
     behind = np.full((*SIZE, 3), 0.5), np.full(SIZE, 7.0)
-    call = quick_jit(
+    call = jax.jit(
         lambda depth, image2, depth2: dof.layered(
             image, depth, LENS, behind=(image2, depth2), max_coc=MAX_COC
         )
@@ -262,7 +269,7 @@ class Plain:
         return np.abs(self.defocus(depth))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@first("name", METHODS)
 def test_a_lens_of_ones_own(name):
     """Like the thin lens whose formula it has, in value and in every derivative."""
     image, depth = (jnp.asarray(x) for x in with_hole())
@@ -273,18 +280,18 @@ def test_a_lens_of_ones_own(name):
     np.testing.assert_allclose(left_out, METHODS[name](image, depth, LENS), rtol=1e-9)
     weight = jnp.asarray(np.random.default_rng(7).normal(size=(*SIZE, 3)))
     loss = lambda depth, lens: jnp.sum(weight * blurred(name)(image, depth, lens))
-    by_depth, by_lens = quick_jit(jax.grad(loss, (0, 1)))(depth, LENS)
-    own_depth, by_own = quick_jit(jax.grad(loss, (0, 1)))(depth, own)
+    by_depth, by_lens = jax.jit(jax.grad(loss, (0, 1)))(depth, LENS)
+    own_depth, by_own = jax.jit(jax.grad(loss, (0, 1)))(depth, own)
     np.testing.assert_allclose(own_depth, by_depth, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(by_own.aperture, by_lens.aperture, rtol=1e-8)
     np.testing.assert_allclose(by_own.focus, by_lens.focus_distance, rtol=1e-7)
     ones = Own(jnp.ones(()), jnp.ones(()))
-    push = quick_jit(lambda own: jax.jvp(lambda lens: loss(depth, lens), (own,), (ones,))[1])
+    push = jax.jit(lambda own: jax.jvp(lambda lens: loss(depth, lens), (own,), (ones,))[1])
     forward = push(own)
     assert float(forward) == pytest.approx(float(by_own.aperture + by_own.focus), rel=1e-7)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@first("name", METHODS)
 def test_any_object_is_a_lens(name):
     image, depth = with_hole(0.0)
     plain = Plain(LENS)
@@ -336,7 +343,7 @@ def test_what_is_no_lens_is_named(method):
         call(image, depth, narrow, max_coc=4)
 
 
-@pytest.mark.parametrize("method", PUBLIC, ids=lambda method: method.__name__)
+@first("method", PUBLIC, ids=lambda method: method.__name__)
 def test_numbers_of_any_kind(method):
     image, depth = scene()
     expected = method(image, depth, LENS, max_coc=4.0)
@@ -349,7 +356,7 @@ def test_numbers_of_any_kind(method):
             inspect.unwrap(method)(image, depth, LENS, max_coc=wrong)
 
 
-@pytest.mark.parametrize("method", PUBLIC, ids=lambda method: method.__name__)
+@first("method", PUBLIC, ids=lambda method: method.__name__)
 def test_types_of_data(method):
     """Depths in whole numbers, halves and other machines' byte order are depths."""
     image, depth = scene()

@@ -9,7 +9,6 @@ import pytest
 
 from jaxfx import FocusPlanes, ThinLens, dof, metrics, relight, scene
 from jaxfx.scene import _embree, _opengl
-from tests.helpers.quick import quick_jit
 
 
 # A lens for which the depths 1, 2 and inf are of defocus -12, 0 and 12 pixels.
@@ -136,6 +135,7 @@ def test_a_second_layer_that_is_nowhere_is_none():
     assert np.abs(two_layers(image, depth, nowhere) - same).max() < 1e-12
 
 
+@pytest.mark.full
 def test_the_gradient_of_an_edge_is_the_difference_quotient():
     """The share of the lens that a silhouette hides moves with the aperture and the focus."""
     image, depth, behind = half_plane(np.array([1.0, 0.5, 0.1]), NEAR, texture(), FOCUS)
@@ -143,15 +143,15 @@ def test_the_gradient_of_an_edge_is_the_difference_quotient():
         image, depth, behind, ThinLens(aperture, focus, 24.0)
     )
     at, along = (0.9, 1.9), (1.0, 0.5)
-    tangent = quick_jit(lambda at: jax.jvp(picture, at, along)[1])(at)
-    picture = quick_jit(picture)
+    tangent = jax.jit(lambda at: jax.jvp(picture, at, along)[1])(at)
+    picture = jax.jit(picture)
     moved = lambda h: picture(*(x + h * v for x, v in zip(at, along, strict=True)))
     quotient = (moved(1e-6) - moved(-1e-6)) / 2e-6
     assert np.abs(tangent - quotient).max() < 1e-5
     assert np.abs(quotient).max() > 0.3
 
 
-@quick_jit
+@jax.jit
 def gradient(image, depth, behind, threshold):
     def loss(*arguments):
         image, depth, behind, threshold = arguments
@@ -162,6 +162,7 @@ def gradient(image, depth, behind, threshold):
 
 
 @pytest.mark.parametrize("depth", [FOCUS, NEAR, 1e-30, np.inf])
+@pytest.mark.full
 def test_gradients_are_finite_at_degenerate_points(depth):
     size = (8, 9)
     behind = texture(8, size), np.full(size, np.inf)
@@ -179,6 +180,7 @@ def test_a_pixel_that_is_not_a_number_stays_local():
     assert not np.any(lost & (distance > RADIUS + 1))
 
 
+@pytest.mark.full
 def test_the_lens_may_be_focus_planes():
     planes = FocusPlanes(near=NEAR, focus=FOCUS, far=9.0, max_coc=12.0)
     near, wall = np.array([1.0, 0.5, 0.1]), np.full((*SIZE, 3), 0.25)
@@ -244,11 +246,13 @@ def scatter_score(still_life):
     )
 
 
+@pytest.mark.full
 def test_one_layer_is_better_than_scatter_on_the_still_life(still_life, scatter_score):
     assert score(still_life, dof.layered) > scatter_score
 
 
 @pytest.mark.parametrize("backend", ["embree", "opengl"])
+@pytest.mark.full
 def test_two_layers_are_better_by_far(still_life, scatter_score, backend):
     problem = {"embree": _embree, "opengl": _opengl}[backend].problem()
     if problem:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxfx import FocusPlanes, ThinLens, dof
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
 
 KERNELS = ("segment_sum", "shift", "tiles", "spans")
@@ -74,6 +74,7 @@ def test_equals_the_loop(kernel):
 
 @hyp.given(st.integers(0, 2**32 - 1), st.floats(0, 3), st.floats(0, 6), st.floats(0.5, 16))
 @hyp.settings(max_examples=20, deadline=None)
+@pytest.mark.full
 def test_kernels_agree(seed, gamma, epsilon, coc):
     image, depth = random_scene(seed)
     lens = ThinLens(0.1, 2.5, 10 * coc)
@@ -95,7 +96,7 @@ def test_kernels_agree(seed, gamma, epsilon, coc):
             np.testing.assert_allclose(result, results[0], atol=tolerance)
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.3, 0.5, 0.51, 1.0, 1.49, 2.7, 7.9, 20.0, 40.0])
+@first("radius", [0.0, 0.3, 0.5, 0.51, 1.0, 1.49, 2.7, 7.9, 20.0, 40.0], 7)
 def test_a_point_of_light_keeps_its_energy_and_place(radius):
     # All pixels are blurred alike, so the weights sum to 1 away from the frame and the picture
     # of a point is its sprite.
@@ -170,20 +171,20 @@ def test_constant_linear_and_mirrored(seed, gamma, epsilon):
         )
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 7, 3), (7, 1, 4), (13, 5, 2)])
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("shape", [(1, 1, 1), (1, 7, 3), (7, 1, 4), (13, 5, 2)])
+@first("kernel", KERNELS)
 def test_any_size(shape, kernel):
     image, depth = random_scene(5, *shape)
     lens = ThinLens(0.1, 2.5, 200.0)
     blur = lambda *data: dof.scatter(*data, lens, max_coc=13, kernel=kernel)
-    result = quick_jit(blur)(image, depth)
+    result = jax.jit(blur)(image, depth)
     np.testing.assert_allclose(
         result, dof.scatter(image, depth, lens, kernel="segment_sum"), atol=1e-12
     )
     assert np.isfinite(result).all()
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
 def test_a_bad_pixel_spoils_what_it_can_reach_and_no_more(kernel):
     image, depth = random_scene(6, 31, 31)
     depth = jnp.full_like(depth, 5.0)
@@ -269,13 +270,13 @@ def compiled(kernel, is_twice=False):
         pushed = jax.jvp(lambda inputs: picture(inputs, kernel), at, along)[1]
         return gradient(inputs, weight), (pushed, None)
 
-    return quick_jit(derivatives)
+    return jax.jit(derivatives)
 
 
 SIGNS = jnp.asarray(np.sin(np.arange(9 * 11 * 3.0) ** 2).reshape(9, 11, 3))
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
 @pytest.mark.parametrize("name", [*PARAMETERS, "image", "depth"])
 def test_gradients(kernel, name):
     inputs = inputs_of(8)
@@ -295,16 +296,17 @@ def test_gradients(kernel, name):
     np.testing.assert_allclose(np.vdot(gradient[name], direction[name]), expected, rtol=1e-6)
 
 
+@pytest.mark.full
 def test_gradients_with_one_tangent_only():
     inputs = inputs_of(8)
     (_, whole), _ = compiled("tiles", True)(inputs, inputs, SIGNS)
     for name in ("gamma", "image"):
         loss = lambda x, n=name: jnp.sum(SIGNS * picture(inputs | {n: x}, "tiles"))
-        alone = quick_jit(jax.grad(loss))(inputs[name])
+        alone = jax.jit(jax.grad(loss))(inputs[name])
         np.testing.assert_allclose(alone, whole[name], atol=1e-10)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
 def test_gradient_at_a_silhouette(kernel):
     """Two flat-coloured planes, the near one before half of the far one: where path tracers'
     thin lenses return zero."""
@@ -340,9 +342,9 @@ DEGENERATE = {
 }
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@first("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("case", DEGENERATE)
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
 def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
     inputs = inputs_of(12, dtype)
     for name, value in DEGENERATE[case].items():
@@ -358,6 +360,7 @@ def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.full
 def test_second_derivatives(kernel):
     inputs, zero = inputs_of(13), jax.tree.map(jnp.zeros_like, inputs_of(13))
     names = ("aperture", "focus_distance", "gamma", "epsilon")
@@ -385,6 +388,7 @@ def test_half_images_keep_their_type():
     np.testing.assert_allclose(result, dof.scatter(image, depth, lens), atol=2e-3)
 
 
+@pytest.mark.full
 def test_focus_planes_are_a_lens():
     image, depth = random_scene(15)
     planes = FocusPlanes(1.0, 2.5, 8.0, 6.0)
@@ -393,7 +397,7 @@ def test_focus_planes_are_a_lens():
             image, depth, planes, gamma=1.0, max_coc=6, kernel=kernel
         )
     )
-    results = [quick_jit(blur(kernel))(image, depth) for kernel in KERNELS]
+    results = [jax.jit(blur(kernel))(image, depth) for kernel in KERNELS]
     np.testing.assert_allclose(results[0], results[1], atol=1e-12)
     assert np.abs(results[0] - image).max() > 0.1
 

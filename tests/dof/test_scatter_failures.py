@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from jaxfx import ThinLens, dof
+from tests.helpers.forms import first
 
 
 KERNELS = ("segment_sum", "shift", "tiles")
@@ -72,7 +73,8 @@ def test_a_thin_bar_in_focus_keeps_its_colour():
 
 
 @pytest.mark.parametrize("peak", [1e2, 1e4, 1e6])
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
+@pytest.mark.full
 def test_highlights_leave_dim_pixels_alone(kernel, peak):
     rng = np.random.default_rng(0)
     image = rng.uniform(0.05, 0.2, (48, 48, 3))
@@ -95,6 +97,7 @@ def test_highlights_leave_dim_pixels_alone(kernel, peak):
     assert np.median(error) < 1e-6
 
 
+@pytest.mark.full
 def test_opaque_slanted_plane_has_no_band():
     """A ramp through focus whose colour is linear: blur keeps it, away from the frame."""
     columns = jnp.arange(64.0) + 0.5

@@ -10,9 +10,6 @@ import pytest
 from jaxfx import FocusPlanes, ThinLens, dof
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
 def clamp(t):
     return min(max(t, 0.0), 1.0)
 

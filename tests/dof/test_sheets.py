@@ -6,10 +6,10 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfx.dof import _sheets
 from jaxfx.dof._slices import Sheets
-from tests.helpers.quick import quick_jit
 
 
 @functools.cache
@@ -58,20 +58,22 @@ def assert_close(one, other):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * np.abs(y).max())
 
 
+@pytest.mark.full
 def test_slices_are_composited_as_the_equations_have_it():
     sheets = random_sheets(2)
     expected = in_plain_numpy(3, sheets)
     for sums in (_sheets.composited, _sheets.plain):
-        assert_close(quick_jit(functools.partial(sums, 3))(sheets), expected)
+        assert_close(jax.jit(functools.partial(sums, 3))(sheets), expected)
 
 
+@pytest.mark.full
 def test_the_derivatives_of_slices_are_those_of_dense_sums():
     """Both modes, of several blocks' sprites, spans and taps, before and behind what fills."""
     sheets = random_sheets(2)
     rng = np.random.default_rng(1)
     along = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), sheets)
 
-    @quick_jit
+    @jax.jit
     def derivatives(sheets, along):
         dense = jax.jvp(functools.partial(_sheets.plain, 3), (sheets,), (along,))[1]
         composited = functools.partial(_sheets.composited, 3)

@@ -17,7 +17,7 @@ from jaxfx.dof._shift import shift
 from jaxfx.dof._spans import spans
 from jaxfx.dof._sprites import Sprites
 from jaxfx.dof._tiles import tiles
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
 
 REACH = 21
@@ -43,9 +43,10 @@ def sums_and_gradient(kernel):
         weight = jnp.sin(jnp.arange(sums.size, dtype=sums.dtype) ** 2).reshape(sums.shape)
         return jnp.sum(weight * sums), sums
 
-    return quick_jit(jax.value_and_grad(loss, has_aux=True))(sprites())
+    return jax.jit(jax.value_and_grad(loss, has_aux=True))(sprites())
 
 
+@pytest.mark.full
 def test_many_blocks_have_the_same_sums():
     (_, expected), _ = sums_and_gradient("shift")
     (_, result), _ = sums_and_gradient("spans")
@@ -53,6 +54,7 @@ def test_many_blocks_have_the_same_sums():
 
 
 @pytest.mark.parametrize("field", Sprites._fields)
+@pytest.mark.full
 def test_many_blocks_have_the_same_gradient(field):
     _, expected = sums_and_gradient("shift")
     _, result = sums_and_gradient("spans")
@@ -67,6 +69,7 @@ def compiled(kernel):
 
 @hyp.given(st.integers(0, 2**32 - 1), st.floats(0.01, 12), st.floats(2, 128))
 @hyp.settings(max_examples=10, deadline=None)
+@pytest.mark.full
 def test_kernels_agree_to_a_radius_of_64(seed, epsilon, largest):
     for dtype, tolerance in ((np.float64, 1e-13), (np.float32, 1e-4)):
         given = sprites(seed, (33, 41), largest, epsilon, dtype)
@@ -78,7 +81,8 @@ def test_kernels_agree_to_a_radius_of_64(seed, epsilon, largest):
 
 
 @pytest.mark.parametrize("bright", [1e2, 1e4, 1e6])
-@pytest.mark.parametrize("share", [1, 40])
+@first("share", [1, 40])
+@pytest.mark.full
 def test_highlights_leave_dim_pixels_alone(bright, share):
     rng = np.random.default_rng(3)
     given = sprites(4, (33, 41), 40.0, 1.0)
@@ -93,7 +97,8 @@ def test_highlights_leave_dim_pixels_alone(bright, share):
     np.testing.assert_allclose(result, exact[:, 31:], rtol=1e-3)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
+@pytest.mark.full
 def test_the_order_of_pixels_is_irrelevant(kernel):
     # The picture of all is the sum of the pictures of any parts, taken in any order.
     given = sprites(7, (33, 41), 30.0)
@@ -105,6 +110,7 @@ def test_the_order_of_pixels_is_irrelevant(kernel):
 
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize(("kernel", "reach"), [("shift", 8), ("tiles", 8), ("spans", 64)])
+@pytest.mark.full
 def test_a_gradient_takes_at_most_24_pictures_of_memory(kernel, reach):
     shape = jax.ShapeDtypeStruct((512, 512, 3), jnp.float32)
     plane = jax.ShapeDtypeStruct((512, 512), jnp.float32)
@@ -140,6 +146,7 @@ def test_the_cost_model_knows_who_is_quickest_where():
     assert module.cheapest(512, 512, 24) == module.cheapest(1024, 1024, 64) == "spans"
 
 
+@pytest.mark.full
 def test_auto_looks_at_the_data_where_it_can(monkeypatch):
     module = importlib.import_module("jaxfx.dof.scatter")
     asked = []
@@ -156,7 +163,8 @@ def test_auto_looks_at_the_data_where_it_can(monkeypatch):
     assert asked == [(5, 6, largest), (5, 6, 9), (5, 6, largest), (5, 6, largest)]
 
 
-@pytest.mark.parametrize("kernel", ["segment_sum", "shift", "tiles", "spans"])
+@first("kernel", ["segment_sum", "shift", "tiles", "spans"])
+@pytest.mark.full
 def test_solvers_run_on_every_kernel(kernel):
     rng = np.random.default_rng(6)
     image = jnp.asarray(rng.random((12, 11, 1)))
@@ -170,7 +178,7 @@ def test_solvers_run_on_every_kernel(kernel):
     tolerance = {"rtol": 1e-6, "atol": 1e-8}
     loss = lambda aperture, reference: jnp.sum(residual(aperture, reference) ** 2)
 
-    @quick_jit
+    @jax.jit
     def solved(start, reference):
         solvers = optx.LevenbergMarquardt(**tolerance), optx.BFGS(**tolerance)
         options = {"args": reference, "throw": False}
@@ -179,7 +187,7 @@ def test_solvers_run_on_every_kernel(kernel):
         _, push = jax.linearize(lambda aperture: residual(aperture, 0.0), start)
         return fitted, least, push(jnp.ones(()))
 
-    start, seen = jnp.asarray(0.1), quick_jit(lambda aperture: residual(aperture, 0.0))
+    start, seen = jnp.asarray(0.1), jax.jit(lambda aperture: residual(aperture, 0.0))
     fitted, least, pushed = solved(start, seen(jnp.asarray(0.12)))
     assert fitted == pytest.approx(0.12, rel=1e-4)
     assert least == pytest.approx(0.12, rel=1e-4)

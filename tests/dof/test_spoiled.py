@@ -11,6 +11,7 @@ from jax.extend import core
 from jaxfx import ThinLens, dof
 from jaxfx.dof import _spoiled
 from jaxfx.dof._spoiled import spoiled
+from tests.helpers.forms import first
 
 
 LENS = ThinLens(0.1, 2.5, 200.0)
@@ -60,8 +61,9 @@ def primitives(jaxpr, skip=()):
                     yield from primitives(getattr(inner, "jaxpr", inner), skip)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@first("name", METHODS)
 @pytest.mark.parametrize("transform", ["jit", "vmap", "grad of vmap"])
+@pytest.mark.full
 def test_a_batch_computes_it_in_a_branch_alone(name, transform, monkeypatch):
     """The cover is marked by an operation that nothing else has."""
     real = _spoiled.sum_all
@@ -82,7 +84,8 @@ def test_a_batch_computes_it_in_a_branch_alone(name, transform, monkeypatch):
     assert "sinh" not in set(primitives(program, skip=("cond",)))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@first("name", METHODS)
+@pytest.mark.full
 def test_one_bad_image_of_a_batch_spoils_itself_alone(name):
     rng = np.random.default_rng(1)
     image, depth = rng.random((3, 12, 14, 2)), rng.uniform(2, 9, (3, 12, 14))

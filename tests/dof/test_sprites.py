@@ -9,9 +9,10 @@ import pytest
 
 from jaxfx import ThinLens, dof
 from jaxfx.dof._sprites import coverage, row_half_width, segment_integral
+from tests.helpers.forms import first
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@first("dtype", [jnp.float32, jnp.float64])
 def test_the_polynomial_is_the_arc(dtype):
     radius = jnp.asarray([0.5, 0.7, 1.0, 3.3, 17.0, 64.0], dtype)
     tolerance = 1e-6 if dtype == jnp.float32 else 1e-11
@@ -28,7 +29,7 @@ def test_the_polynomial_is_the_arc(dtype):
         np.testing.assert_allclose(slope, slopes, atol=tolerance * 64)
 
 
-@pytest.mark.parametrize("radius", [0.5, 0.8, 2.0, 7.3])
+@first("radius", [0.5, 0.8, 2.0, 7.3], 2)
 def test_what_a_disc_covers_is_as_much_as_in_counted_points(radius):
     reach, fine = int(radius + 1), 64
     rows = jnp.arange(-reach, reach + 1)
@@ -43,8 +44,9 @@ def test_what_a_disc_covers_is_as_much_as_in_counted_points(radius):
     np.testing.assert_allclose(np.asarray(cover).sum(axis=1), counted, atol=2e-2)
 
 
-@pytest.mark.parametrize("name", ["scatter", "layered", "depth_sorted"])
-@pytest.mark.parametrize(("aperture", "is_moving"), [(0.004, False), (0.1, True), (3.0, False)])
+@first("name", ["scatter", "layered", "depth_sorted"])
+@first(("aperture", "is_moving"), [(0.004, False), (0.1, True), (3.0, False)])
+@pytest.mark.full
 def test_a_circle_below_a_pixel_or_above_max_coc_moves_nothing(name, aperture, is_moving):
     """Circles of 0.1 pixels at the most, of 0.6 to 3, and of 17 at the least."""
     rng = np.random.default_rng(0)

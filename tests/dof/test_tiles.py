@@ -38,6 +38,7 @@ def sums_and_gradient(kernel):
     return jax.jit(jax.value_and_grad(loss, has_aux=True))(sprites())
 
 
+@pytest.mark.full
 def test_many_tiles_have_the_same_sums():
     (_, expected), _ = sums_and_gradient(shift)
     (_, result), _ = sums_and_gradient(tiles)
@@ -45,6 +46,7 @@ def test_many_tiles_have_the_same_sums():
 
 
 @pytest.mark.parametrize("field", Sprites._fields)
+@pytest.mark.full
 def test_many_tiles_have_the_same_gradient(field):
     _, expected = sums_and_gradient(shift)
     _, result = sums_and_gradient(tiles)

@@ -11,8 +11,6 @@ from PIL import Image
 from jaxfx import exr
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 SCRIPT = Path(__file__).parents[2] / "examples" / "orbit.py"
 
 

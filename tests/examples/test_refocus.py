@@ -13,8 +13,6 @@ from PIL import Image
 from jaxfx import exr, io
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 SCRIPT = Path(__file__).parents[2] / "examples" / "refocus.py"
 HEIGHT, WIDTH = 30, 40
 NEAR, FAR = 1.0, 2.0

@@ -304,4 +304,5 @@ def test_reading_under_a_redirect_of_others(tmp_path, monkeypatch):
         for _ in range(40):
             exr.read(tmp_path / "a.exr")
         done.set()
-        assert sys.stdout.getvalue() == ".\n" * talker.result()
+        said = talker.result()
+        assert sys.stdout.getvalue() == ".\n" * said

@@ -50,6 +50,7 @@ def test_blender_multilayer(tmp_path, dtype, sky):
     np.testing.assert_array_equal(found_depth, CLEAN)
 
 
+@pytest.mark.full
 def test_two_view_layers_are_an_image_and_what_is_behind_it(tmp_path):
     path = tmp_path / "a.exr"
     blender(path, {"ViewLayer": depth(1e10), "Behind": depth(1e10) + 1})

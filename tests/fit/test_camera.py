@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, fit, relight, scene
+from tests.helpers.forms import first
 
 
 SIDE = 128
@@ -52,7 +53,8 @@ def apart(one, other):
     return angle, b[:3, :3].T @ (a[:3, 3] - b[:3, 3])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@first("seed", range(3))
+@pytest.mark.full
 def test_a_rendered_views_pose_is_recovered(seed):
     reference, image, depth, source, true = pictures()
     rng = np.random.default_rng(seed)
@@ -73,6 +75,7 @@ def test_a_rendered_views_pose_is_recovered(seed):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("hole", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.full
 def test_one_hole_in_the_depth_has_no_say(hole, dtype):
     y, x = np.mgrid[:32, :32] / 32
     image = np.stack([np.sin(9 * x + 3 * y), np.cos(7 * y), np.sin(5 * x * y)], -1) / 2 + 0.5
@@ -88,6 +91,7 @@ def test_one_hole_in_the_depth_has_no_say(hole, dtype):
     np.testing.assert_allclose(found.camera.world_from_camera, eye.world_from_camera, atol=1e-5)
 
 
+@pytest.mark.full
 def test_a_pose_is_recovered_from_a_depth_with_holes():
     """As a depth camera leaves them: blobs, and a strip beside each step."""
     reference, image, depth, source, true = pictures()
@@ -106,6 +110,7 @@ def test_a_pose_is_recovered_from_a_depth_with_holes():
     assert found.success and angle < 0.1 and np.linalg.norm(distance) < 0.01
 
 
+@pytest.mark.full
 def test_failure_is_said():
     reference, image, depth, source, true = pictures()
     away = moved(true, (0, 1, 0), 180.0, (0, 0, 0))

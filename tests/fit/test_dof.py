@@ -12,6 +12,7 @@ import optimistix as optx
 import pytest
 
 from jaxfx import FocusPlanes, ThinLens, dof, fit
+from tests.helpers.forms import first
 
 
 SIZE = 48
@@ -76,8 +77,8 @@ def quietly(reference, image, depth, values=TRUTH, max_coc=8, **kwargs):
     return fit.dof(reference, image, depth, max_coc=max_coc, progress=False, **arguments)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("sides", list(itertools.product((0, 1), repeat=4)), ids=str)
+@first("dtype", [np.float32, np.float64])
+@first("sides", list(itertools.product((0, 1), repeat=4)), ids=str)
 def test_recovers_what_made_the_picture(sides, dtype):
     fitted = quietly(*picture(dtype), wrong(sides))
     assert fitted.success
@@ -89,7 +90,7 @@ def test_recovers_what_made_the_picture(sides, dtype):
     assert len(fitted.losses) < 80
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_the_threshold_of_layered_scatter_is_found():
     image, depth = still_life(16)
     lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 40.0)
@@ -106,7 +107,7 @@ def test_the_threshold_of_layered_scatter_is_found():
     assert set(fitted.uncertainty) == set(fit.LAYERED_PARAMETERS)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_a_lens_that_no_derivative_moves_may_be_held():
     """Below a pixel it can't be found, but what else there is can be."""
     image, depth = still_life(16)
@@ -117,6 +118,7 @@ def test_a_lens_that_no_derivative_moves_may_be_held():
     assert held.uncertainty["gamma"] > 1e6
 
 
+@pytest.mark.full
 def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
     reference, image, depth = picture()
     start = dof.scatter(image, depth, **options(wrong((1, 1, 1, 1))))
@@ -126,14 +128,14 @@ def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
     np.testing.assert_allclose(fitted.image, again, atol=1e-12)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_a_search_that_runs_out_of_room_goes_on_with_more():
     fitted = quietly(*picture(), wrong((0, 0, 1, 1)), max_coc=None)
     assert fitted.success and fitted.clamped == 0
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_says_what_was_clamped():
     reference, image, depth = picture()
     fitted = quietly(reference, image, depth, parameters=("gamma",), max_coc=3.5)
@@ -142,10 +144,10 @@ def test_says_what_was_clamped():
     assert fitted.clamped == pytest.approx(share)
 
 
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     "free", [("aperture", "focus_distance"), ("epsilon", "gamma")], ids="-".join
 )
+@pytest.mark.full
 def test_what_is_frozen_stays(free):
     start = TRUTH | {name: wrong((1, 1, 1, 1))[name] for name in free}
     fitted = quietly(*picture(), start, parameters=free)
@@ -157,8 +159,7 @@ def test_what_is_frozen_stays(free):
 TOLERANCE = {"rtol": 1e-6, "atol": 1e-8}
 
 
-@pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize(
+@first(
     "solver",
     [
         optx.GaussNewton(**TOLERANCE),
@@ -167,6 +168,7 @@ TOLERANCE = {"rtol": 1e-6, "atol": 1e-8}
     ],
     ids=lambda solver: type(solver).__name__,
 )
+@pytest.mark.full
 def test_any_solver_or_minimiser(solver):
     fitted = quietly(
         *picture(),
@@ -178,6 +180,7 @@ def test_any_solver_or_minimiser(solver):
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
 
 
+@pytest.mark.full
 def test_failure_is_said():
     start = wrong((0, 1, 0, 1))
     said = r"found no l\w+ in \d+ steps.*from [\de.-]+ to [\de.-]+"
@@ -200,7 +203,7 @@ def behind_the_focus():
     return reference + noise, image, depth, values
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_a_solver_that_breaks_down_leaves_what_it_had():
     # Without damping, a parameter without a derivative is a division by zero.
     reference, image, depth, values = behind_the_focus()
@@ -210,7 +213,7 @@ def test_a_solver_that_breaks_down_leaves_what_it_had():
     assert found(fitted) == pytest.approx(values)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_what_the_picture_cannot_tell_is_uncertain():
     fitted = quietly(*behind_the_focus())
     assert fitted.uncertainty["gamma"] == fitted.uncertainty["epsilon"] == np.inf
@@ -220,6 +223,7 @@ def test_what_the_picture_cannot_tell_is_uncertain():
     assert alone.uncertainty["aperture"] < 0.01 * TRUTH["aperture"]
 
 
+@pytest.mark.full
 def test_uncertainty_is_the_spread_over_draws_of_noise():
     reference, image, depth = picture()
     rng = np.random.default_rng(2)
@@ -270,6 +274,7 @@ def test_bad_arguments_are_named(message, fault):
         inspect.unwrap(fit.dof)(**given | {"progress": False} | fault)
 
 
+@pytest.mark.full
 def test_missing_depths_do_not_spoil_a_fit():
     """A tenth of the depths is missing, by each of the signs for it."""
     reference, image, depth = picture()

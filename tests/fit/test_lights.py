@@ -102,12 +102,13 @@ def picture():
 
 
 @pytest.mark.parametrize("start", WRONG, ids=["far", "near"])
+@pytest.mark.full
 def test_recovers_three_lights(start):
     assert_recovers(TRUTH, start, np.float64)
 
 
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("start", WRONG, ids=["far", "near"])
+@pytest.mark.full
 def test_recovers_in_float32(start):
     assert_recovers(TRUTH[1:2], start[1:2], np.float32)
 
@@ -122,6 +123,7 @@ def assert_recovers(truth, start, dtype):
     np.testing.assert_allclose(fitted.image, reference, atol=1e-3)
 
 
+@pytest.mark.full
 def test_brightness_does_not_matter():
     """Nor do the start's colours, which are never used."""
     start = [type(light)(**vars(light) | {"color": 0 * WHITE}) for light in WRONG[0]]
@@ -131,7 +133,7 @@ def test_brightness_does_not_matter():
     np.testing.assert_allclose(fitted.losses[-1], 0, atol=1e-14)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_what_is_frozen_stays():
     truth = TRUTH[1:]
     wrong = {"direction": WRONG[0][2].direction, "outer_angle": jnp.array(0.65)}
@@ -145,6 +147,7 @@ def test_what_is_frozen_stays():
     assert [set(each) for each in fitted.uncertainty] == [set(), {"direction", "angles"}]
 
 
+@pytest.mark.full
 def test_failure_is_said():
     said = r"found no l\w+ in \d+ steps.*from [\de.-]+ to [\de.-]+"
     with pytest.raises(RuntimeError, match=said):
@@ -163,7 +166,6 @@ SUNS = (
 )
 
 
-@pytest.mark.usefixtures("quick")
 def test_colors_alone_are_a_linear_problem():
     """By NumPy's least squares, of a reference that no lights explain."""
     rng = np.random.default_rng(0)
@@ -205,8 +207,8 @@ DEPENDENT = {
 }
 
 
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("made", "lights", "groups"), DEPENDENT.values(), ids=DEPENDENT)
+@pytest.mark.full
 def test_lights_that_cannot_be_told_apart(made, lights, groups):
     reference = relight.render(made(), CAMERA, lights)
     fitted = colors_of(reference, made(), lights)
@@ -218,7 +220,7 @@ def test_lights_that_cannot_be_told_apart(made, lights, groups):
             np.testing.assert_allclose(fitted.lights[one].color, fitted.lights[other].color)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.full
 def test_suns_over_a_matt_hill_are_dependent_but_for_three():
     """What is lit everywhere and has no highlight sees the sum of the suns alone."""
     hill = cache()
@@ -233,6 +235,7 @@ def test_suns_over_a_matt_hill_are_dependent_but_for_three():
     assert colors_of(reference, hill, suns).indistinct == ((0, 1, 2, 3),)
 
 
+@pytest.mark.full
 def test_uncertainty_is_the_spread_over_draws_of_noise():
     reference = relight.render(cache(), CAMERA, SUNS)
     rng = np.random.default_rng(2)
@@ -252,6 +255,7 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
 
 
 @pytest.mark.parametrize("missing", [0.0, -1.0, np.nan])
+@pytest.mark.full
 def test_a_pixel_whose_depth_is_missing_has_no_say(missing):
     gbuffer, lights = cache(), TRUTH[:2]
     reference = relight.render(gbuffer, CAMERA, lights)
@@ -270,6 +274,7 @@ AWAY = (PointLight([0.0, 0.0, 50.0], WHITE), SpotLight([0, 0, -1], [0, 0, -1], W
 
 
 @pytest.mark.parametrize("light", AWAY, ids=lambda light: type(light).__name__)
+@pytest.mark.full
 def test_a_start_that_nothing_moves_is_said(light, caplog):
     """The log names it beside others; alone it is an error."""
     fitted = quietly(picture(), cache(), (*SUNS, light), throw=False)
@@ -320,6 +325,7 @@ def boxes():
 
 
 @pytest.mark.parametrize("about", [0.4, 0.4 + np.pi])
+@pytest.mark.full
 def test_a_sun_by_its_shadow(about):
     sky, sun = (
         AmbientLight(WHITE),
@@ -339,6 +345,7 @@ def test_a_sun_by_its_shadow(about):
     assert boxes().miss(fitted.lights[1]) < 0.5
 
 
+@pytest.mark.full
 def test_without_shadows_a_sun_is_a_sky():
     """Nor can its height be told from its brightness."""
     start = AmbientLight(WHITE), DirectionalLight(boxes().sun, WHITE)

@@ -18,9 +18,8 @@ from jaxfx import (
     SpotLight,
     fit,
 )
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 SIZE, SCALE = 48, 12.0
 PLANE, PLATE, HALF = 4.0, 2.5, 0.5
@@ -119,7 +118,7 @@ def test_it_moves_against_a_light_nearby(kind):
     np.testing.assert_allclose(moved - home, [-0.1 * ratio, 0.05 * ratio], atol=2e-3)
 
 
-@pytest.mark.parametrize(
+@first(
     ("camera", "make", "start"),
     [
         (STRAIGHT, lambda v: DirectionalLight(v, jnp.ones(3)), [0.05, -0.1, 1.0]),
@@ -141,7 +140,7 @@ def test_derivatives_against_differences(camera, make, start):
     assert np.abs(reverse).max() > 1
 
 
-@pytest.mark.parametrize("missing", [0.0, -1.0, np.nan])
+@first("missing", [0.0, -1.0, np.nan])
 def test_what_is_missing_shadows_nothing_and_spoils_no_derivative(missing):
     """In the map it is as nothing there; in the cache, whose normals then are no numbers."""
     gbuffer = plane()

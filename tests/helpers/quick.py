@@ -9,11 +9,6 @@ import jax
 from jax.test_util import check_jvp, check_vjp
 
 
-# Compiling is most of the tests' work. What a user runs is compiled with all optimisation: that
-# it is right too is shown by tests of values, which call `jax.jit` or the function alone.
-quick_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
-
 @contextlib.contextmanager
 def _compiled(is_optimised: bool) -> Iterator[None]:
     """Compile with all optimisation, or with little, whatever is compiled in this context.
@@ -40,8 +35,8 @@ def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: f
 
     `jax.test_util.check_grads` does the same and compiles each mode several times.
     """
-    value, push = quick_jit(function), quick_jit(functools.partial(jax.jvp, function))
-    pull = quick_jit(lambda at, weight: jax.vjp(function, *at)[1](weight))
+    value, push = jax.jit(function), jax.jit(functools.partial(jax.jvp, function))
+    pull = jax.jit(lambda at, weight: jax.vjp(function, *at)[1](weight))
     check_jvp(value, push, arguments, **tolerances)
     check_vjp(
         value, lambda *at: (value(*at), functools.partial(pull, at)), arguments, **tolerances

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfx import DirectionalLight, GBuffer, PinholeCamera, metrics, relight, scene
 
@@ -45,6 +46,7 @@ def test_the_mean_of_two_normals_is_a_third_surface():
     np.testing.assert_allclose(before, slope, rtol=1e-12)
 
 
+@pytest.mark.full
 def test_averaging_first_is_wrong_along_silhouettes():
     height, width = 24, 32
     size, fine = ({"height": n * height, "width": n * width} for n in (1, FINE))

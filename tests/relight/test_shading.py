@@ -19,10 +19,8 @@ from jaxfx import (
     relight,
 )
 from tests.cases.relight_views import FRONT, REFLECTANCES, one_pixel, sun
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 SHADERS = {"lambert": 0, "phong": 1, "blinn": 2}
 LIGHTS = {
@@ -136,8 +134,8 @@ def test_equals_the_loop(camera, light, shader):
     np.testing.assert_allclose(result, expected, rtol=1e-10, atol=1e-13)
 
 
-@each_light
-@each_camera
+@first("light", [*LIGHTS.values()][::-1], ids=[*LIGHTS][::-1])
+@first("camera", ["pinhole", "orthographic"])
 def test_both_modes_equal_finite_differences(camera, light):
     gbuffer = make_gbuffer(3, 3, 4)
     camera = make_camera(camera, 3, 4)
@@ -158,7 +156,7 @@ def test_both_modes_equal_finite_differences(camera, light):
 
     along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), arguments)
     pushed = lambda arguments: jax.jvp(score, (arguments,), (along,))[1]
-    both = quick_jit(lambda arguments: (jax.grad(score)(arguments), pushed(arguments)))
+    both = jax.jit(lambda arguments: (jax.grad(score)(arguments), pushed(arguments)))
     reverse, forward = both(arguments)
     still = set()
     for which, (path, slopes) in enumerate(jax.tree.leaves_with_path(reverse)):
@@ -209,6 +207,7 @@ def image_and_slopes(gbuffer, camera, lights):
 
 @pytest.mark.parametrize("shader", [0, 1, 2])
 @pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.full
 def test_a_nan_stays_in_its_pixel_and_is_not_hidden(field, shader):
     gbuffer = make_gbuffer(5)
     pixel = tuple(np.argwhere(np.asarray(gbuffer.shader) == shader)[0])
@@ -225,6 +224,7 @@ def test_a_nan_stays_in_its_pixel_and_is_not_hidden(field, shader):
         assert np.array_equal(one[elsewhere], other[elsewhere])
 
 
+@pytest.mark.full
 def test_background_is_black_whatever_it_holds():
     gbuffer = make_gbuffer(6)
     nothing = np.asarray(gbuffer.shader) == -1
@@ -240,7 +240,7 @@ def test_background_is_black_whatever_it_holds():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
 
 
-@each_light
+@first("light", LIGHTS.values(), ids=LIGHTS.keys())
 def test_visibility_multiplies(light):
     gbuffer, camera = make_gbuffer(1), make_camera("pinhole", 7, 9)
     nothing = np.asarray(gbuffer.shader) == -1
@@ -248,7 +248,7 @@ def test_visibility_multiplies(light):
     image = lambda light, visibility: relight.shade(gbuffer, camera, light, visibility)
     plain = np.asarray(relight.shade(gbuffer, camera, light))
 
-    @quick_jit
+    @jax.jit
     def value_and_slopes(light, visibility):
         result, pull = jax.vjp(image, light, visibility)
         return result, *pull(jnp.ones_like(result))
@@ -275,6 +275,7 @@ def test_render_is_the_sum_of_lights(camera):
     )
 
 
+@pytest.mark.full
 def test_render_with_shadows_is_the_sum_of_shaded_lights():
     gbuffer, camera = make_gbuffer(2), make_camera("pinhole", 7, 9)
     rng = np.random.default_rng(2)
@@ -305,6 +306,7 @@ def test_no_lights_are_black():
     assert not image.any()
 
 
+@pytest.mark.full
 def test_gradients_of_render_equal_finite_differences():
     arguments = make_gbuffer(4), make_camera("pinhole", 7, 9), list(LIGHTS.values())
     floats, shader = eqx.partition(arguments, eqx.is_inexact_array)
@@ -321,11 +323,12 @@ def test_gradients_of_render_equal_finite_differences():
     products = jax.tree.map(jnp.vdot, tuple(reverse), along)
     np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-7)
     image = lambda floats: relight.render(*eqx.combine(floats, shader))
-    forward = quick_jit(lambda along: jax.jvp(image, (floats,), (along,))[1])(along)
+    forward = jax.jit(lambda along: jax.jvp(image, (floats,), (along,))[1])(along)
     np.testing.assert_allclose(forward.sum(), expected, rtol=1e-7)
 
 
 @pytest.mark.usefixtures("optimised")
+@pytest.mark.full
 def test_reverse_memory_does_not_grow_with_the_lights():
     size = 64
     gbuffer = make_gbuffer(0, size, size, background=False)
@@ -353,7 +356,7 @@ def test_the_program_does_not_grow_with_the_picture():
     assert not any("320" in line for line in loops)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-4), (np.float16, 2e-2)])
+@first(("dtype", "tolerance"), [(np.float32, 1e-4), (np.float16, 2e-2)])
 def test_the_type_of_the_image_is_kept(dtype, tolerance):
     camera, lights = make_camera("pinhole", 7, 9), list(LIGHTS.values())
     gbuffer = make_gbuffer(1)
@@ -365,7 +368,7 @@ def test_the_type_of_the_image_is_kept(dtype, tolerance):
     assert relight.shade(cast(gbuffer, dtype), camera, lights[2], visible).dtype == dtype
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 5), (6, 1)])
+@first("size", [(1, 1), (1, 5), (6, 1)])
 def test_any_size_and_batches_of_lights(size):
     gbuffer, camera = make_gbuffer(0, *size, background=False), make_camera("pinhole", *size)
     lights = [LIGHTS["spot"], jax.tree.map(lambda leaf: leaf * 1.01, LIGHTS["spot"])]
@@ -414,6 +417,7 @@ def test_faults_name_the_argument():
             call(edited, camera, lights)
 
 
+@pytest.mark.full
 def test_booleans_are_visibilities():
     gbuffer, camera = make_gbuffer(3), make_camera("pinhole", 7, 9)
     seen = np.random.default_rng(4).random((7, 9)) < 0.5
@@ -475,6 +479,7 @@ def test_a_traced_roughness_above_1_is_1():
     np.testing.assert_array_equal(slope(2.0), 0)
 
 
+@pytest.mark.full
 def test_a_traced_cone_out_of_order_is_dark():
     gbuffer, camera = make_gbuffer(7), make_camera("pinhole", 7, 9)
     spot = LIGHTS["spot"]

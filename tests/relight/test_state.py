@@ -19,10 +19,7 @@ from jaxfx import (
     relight,
     scene,
 )
-from tests.helpers.quick import quick_jit
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 SIZE = (7, 9)
 CAMERA = PinholeCamera.from_fov(0.9, height=SIZE[0], width=SIZE[1])
@@ -79,6 +76,7 @@ def assert_close(image, expected, tolerance=1e-12):
     np.testing.assert_allclose(image, expected, rtol=0, atol=limit)
 
 
+@pytest.mark.full
 def test_every_method_gives_the_picture_of_its_lights():
     lights = make_lights(6)
     state = relight.start(GBUFFER, CAMERA, lights)
@@ -107,6 +105,7 @@ def test_no_lights_are_black_and_lights_can_come_and_go():
     assert not state.image.any()
 
 
+@pytest.mark.full
 def test_visibility_goes_with_its_light():
     """Against the sum of `shade`, for lights with shadows and without, of every kind."""
     rng = np.random.default_rng(3)
@@ -127,6 +126,7 @@ def test_visibility_goes_with_its_light():
     assert_close(state.image, expected(state))
 
 
+@pytest.mark.full
 def test_an_edit_keeps_the_shadow_unless_told_otherwise():
     rng = np.random.default_rng(5)
     lights, new = make_lights(4), make_lights(4, seed=8)
@@ -150,6 +150,7 @@ def test_an_edit_keeps_the_shadow_unless_told_otherwise():
         assert_close(without.image, shaded(None))
 
 
+@pytest.mark.full
 def test_float32_stays_float32():
     state = relight.start(SINGLE, CAMERA, make_lights(4)).edit(1, make_lights(1)[0])
     assert state.image.dtype == jnp.float32
@@ -162,6 +163,7 @@ def drift(state, gbuffer=SINGLE):
     return float(jnp.max(jnp.abs(state.image - expected)) / jnp.max(expected))
 
 
+@pytest.mark.full
 def test_a_chain_of_edits_of_several_kinds_does_not_drift():
     """2000 edits in float32, of lights over four orders of magnitude: 2e-7 of the range."""
     rng = np.random.default_rng(4)
@@ -226,6 +228,7 @@ def test_a_bad_pixel_stays_where_it_is():
 
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("count", [10, 100, 1000])
+@pytest.mark.full
 def test_the_work_of_an_edit_does_not_depend_on_the_number_of_lights(count):
     """Counted in what is compiled; `benchmarks` has the times."""
 
@@ -244,6 +247,7 @@ def test_the_work_of_an_edit_does_not_depend_on_the_number_of_lights(count):
 
 
 @pytest.mark.parametrize("make", KINDS, ids=lambda make: make.__name__)
+@pytest.mark.full
 def test_derivatives_in_the_edited_light_are_those_of_shading_it(make):
     """Forward and reverse; `shade`'s own are compared with differences in its tests."""
     light, old = make_lights(2, kinds=(make,))
@@ -253,7 +257,7 @@ def test_derivatives_in_the_edited_light_are_those_of_shading_it(make):
     edited = lambda light, shadow: state.edit(0, light, shadow).image
     shaded = lambda light, shadow: relight.shade(GBUFFER, CAMERA, light, shadow)
 
-    @quick_jit
+    @jax.jit
     def derivatives(light, shadow):
         pushed, expected = (
             jax.jvp(image, (light, shadow), along)[1] for image in (edited, shaded)
@@ -269,6 +273,7 @@ def test_derivatives_in_the_edited_light_are_those_of_shading_it(make):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.full
 def test_derivatives_in_the_cache_are_those_of_render():
     lights = make_lights(4)
     state = relight.start(GBUFFER, CAMERA, [*lights[:3], lights[0]])
@@ -285,7 +290,7 @@ def test_derivatives_in_the_cache_are_those_of_render():
     def rendered(floats):
         return jnp.sum(jnp.sin(relight.render(eqx.combine(floats, others), CAMERA, lights)))
 
-    one, other = (quick_jit(jax.grad(image))(floats) for image in (edited, rendered))
+    one, other = (jax.jit(jax.grad(image))(floats) for image in (edited, rendered))
     for name in ("ambient", "diffuse", "specular", "normal", "depth", "roughness"):
         np.testing.assert_allclose(
             getattr(one, name), getattr(other, name), rtol=1e-8, atol=1e-10
@@ -293,7 +298,7 @@ def test_derivatives_in_the_cache_are_those_of_render():
     assert state.image.shape == (*SIZE, 3)
 
 
-@quick_jit
+@jax.jit
 def both_modes(floats, others, light):
     def loss(floats, light):
         state = relight.start(eqx.combine(floats, others), CAMERA, [light])
@@ -313,6 +318,7 @@ def both_modes(floats, others, light):
     ],
     ids=["at-surface", "grazing", "behind", "on-axis"],
 )
+@pytest.mark.full
 def test_derivatives_at_degenerate_points_are_finite(light):
     """Smooth and rough surfaces of every model, the middle one on the camera's axis."""
     images = ("color", "ambient", "diffuse", "specular")
@@ -387,7 +393,7 @@ def test_derivatives_of_paint():
     loss = lambda new: jnp.sum(jnp.sin(state.paint(MASK, **new).image))
     along = {name: np.cos(value) for name, value in new.items()}
 
-    @quick_jit
+    @jax.jit
     def derivatives(new):
         value, pushed = jax.jvp(loss, (new,), (along,))
         return value, pushed, jax.grad(loss)(new)
@@ -432,6 +438,7 @@ def test_errors_name_the_argument():
         paint(state, MASK, color=0.5)
 
 
+@pytest.mark.full
 def test_what_is_rendered_anew_is_what_is_edited():
     """The two pictures that the benchmark times are the same, shadows and all."""
     mesh, camera = relight_scenes.view((24, 32))

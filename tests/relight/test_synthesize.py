@@ -25,10 +25,8 @@ from tests.cases.relight_views import (
     plane,
     points,
 )
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 FLOATS = ("color", "ambient", "diffuse", "specular", "roughness", "normal")
 
@@ -191,6 +189,7 @@ def test_a_bad_pixel_of_a_cache_reaches_only_those_that_read_it(name):
 
 
 @pytest.mark.parametrize("name", ["color", "normal", "depth"])
+@pytest.mark.full
 def test_a_bad_pixel_of_a_cache_spoils_no_derivative_of_the_cameras(name):
     """Where another cache has the point: by detail, the weights follow the cameras."""
     gbuffers = [FRONTAL(camera) for camera in CAMERAS]
@@ -204,7 +203,7 @@ def test_a_bad_pixel_of_a_cache_spoils_no_derivative_of_the_cameras(name):
         options = {"depth": depth, "weights": "detail", "tolerance": 0.03}
         return relight.synthesize(gbuffers, cameras, target, **options)[0].color
 
-    @quick_jit
+    @jax.jit
     def derivatives(cameras, target):
         value, pull = jax.vjp(color, cameras, target)
         return value, pull(jnp.ones_like(value)), jax.jvp(color, *[(cameras, target)] * 2)[1]
@@ -287,6 +286,7 @@ def test_detail_favours_the_camera_that_is_nearer():
 
 
 @pytest.mark.parametrize("weights", ["equal", "detail"])
+@pytest.mark.full
 def test_derivatives_in_the_caches_and_cameras(weights):
     """Forward, reverse and differences: in float64 the steps move no point to another pixel."""
     tilted = plane([0.1, 0.2, -1])
@@ -303,13 +303,13 @@ def test_derivatives_in_the_caches_and_cameras(weights):
         images = eqx.filter(found, eqx.is_inexact_array)
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(images))
 
-    @quick_jit
+    @jax.jit
     def derivatives(arguments, along):
         pushed = jax.jvp(loss, arguments, along)[1]
         return pushed, jax.grad(loss, argnums=(0, 1, 2, 3))(*arguments)
 
     pushed, pulled = derivatives(arguments, along)
-    value = quick_jit(lambda h: loss(*jax.tree.map(lambda x, v: x + h * v, arguments, along)))
+    value = jax.jit(lambda h: loss(*jax.tree.map(lambda x, v: x + h * v, arguments, along)))
     quotient = float(value(1e-7) - value(-1e-7)) / 2e-7
     assert float(pushed) == pytest.approx(quotient, rel=1e-5)
     pairs = zip(jax.tree.leaves(pulled), jax.tree.leaves(along), strict=True)
@@ -319,6 +319,7 @@ def test_derivatives_in_the_caches_and_cameras(weights):
 # --- The choice of caches.
 
 
+@pytest.mark.full
 def test_best_caches_sees_most_first_and_never_twice(caches):
     gbuffers, cameras = caches
     target = orbit(12, 0.1, LARGE)
@@ -360,7 +361,8 @@ def new_view(caches, count, degrees):
     return target, truth, found, np.asarray(coverage)
 
 
-@pytest.mark.parametrize("degrees", [5, 15, 30])
+@first("degrees", [5, 15, 30])
+@pytest.mark.full
 def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
     """PSNR of every parameter, ids exact, and the relit picture, filled and outside holes."""
     shares = []

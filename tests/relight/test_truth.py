@@ -28,6 +28,7 @@ def all_of(stage, shadows):
     return np.sum(each, axis=0)
 
 
+@pytest.mark.full
 def test_direct_light_without_shadows_is_the_path_tracers_to_rounding(stage):
     """Some five pixels of 3072 have their centre on an edge and show another face there."""
     _, camera, gbuffer = stage
@@ -39,6 +40,7 @@ def test_direct_light_without_shadows_is_the_path_tracers_to_rounding(stage):
     assert metrics.psnr(image, expected) > 40
 
 
+@pytest.mark.full
 def test_direct_light_with_shadows_is_the_path_tracers_to_rounding(stage):
     mesh, camera, gbuffer = stage
     lights = [*truth.LIGHTS.values()]
@@ -52,6 +54,7 @@ def test_direct_light_with_shadows_is_the_path_tracers_to_rounding(stage):
     assert metrics.psnr(image, expected) > 38
 
 
+@pytest.mark.full
 def test_a_bounce_is_the_path_tracers_but_for_the_noise_of_both():
     size = (24, 32)
     mesh = scene.still_life()

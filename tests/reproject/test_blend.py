@@ -10,9 +10,6 @@ from jaxfx import PinholeCamera
 from jaxfx.reproject import blend, choose, warp
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
 def camera(x=0.0, turn=0.0, height=16, width=24):
     pose = np.eye(4)
     c, s = np.cos(turn), np.sin(turn)
@@ -60,6 +57,7 @@ def test_the_nearer_surface_hides_the_farther():
     np.testing.assert_array_equal(drawn, 1)
 
 
+@pytest.mark.full
 def test_the_choice_is_what_shows_most_and_then_what_it_lacks():
     moves = [(0.0, 3.1), (-0.6, 0.0), (-0.5, 0.0), (0.7, 0.0)]
     eyes = [camera(*move) for move in moves]

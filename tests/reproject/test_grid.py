@@ -2,12 +2,9 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxfx.reproject import _grid
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 HEIGHT, WIDTH = 6, 9
 

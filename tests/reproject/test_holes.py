@@ -7,10 +7,8 @@ import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera
 from jaxfx.reproject import blend, choose, intersect, warp
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 MISSING = (0.0, -0.0, -1.0, -np.inf, np.nan)
 HEIGHT, WIDTH = 12, 16
@@ -70,7 +68,8 @@ def test_a_stereo_pair_draws_its_own_pixels_and_no_pixel_of_a_hole(hole):
         assert not alpha[~own].any()
 
 
-@pytest.mark.parametrize("method", ["pyramid", "descent", "linear", "relief"])
+@first("method", ["pyramid", "descent", "linear", "relief"])
+@pytest.mark.full
 def test_beside_holes_a_slanted_floor_is_what_a_splat_of_its_points_shows(method):
     height, width = 48, 64
     source, target = (camera(at, 0.0, height, width) for at in ((0, 0, 0), (0.3, -0.1, 0.2)))
@@ -97,6 +96,7 @@ def test_beside_holes_a_slanted_floor_is_what_a_splat_of_its_points_shows(method
     assert np.median(off) < 0.25 / height and (off < 0.7 / height).all()
 
 
+@pytest.mark.full
 def test_the_colour_before_a_hole_is_its_own_pixels():
     """A patch beside a hole is that of the known texels: their colour, to the border."""
     image = np.broadcast_to(np.arange(WIDTH)[None, :, None], (HEIGHT, WIDTH, 1)) * 1.0
@@ -167,7 +167,7 @@ CALLS = {
 def derivatives(function):
     """A program that gives a value, its tangent, its cotangents, and both sides' product."""
 
-    @quick_jit
+    @jax.jit
     def both(arguments, along, weight):
         value, pushed = jax.jvp(function, arguments, along)
         pulled = jax.vjp(function, *arguments)[1](weight)
@@ -195,6 +195,7 @@ def check_finite(both, function, arguments):
 
 @pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("kind", ["pinhole", "orthographic"])
+@pytest.mark.full
 def test_no_hole_makes_a_derivative_not_finite(call, kind):
     """In every argument, in both modes: also of a target that is the source."""
     both = derivatives(CALLS[call])
@@ -207,7 +208,8 @@ def test_no_hole_makes_a_derivative_not_finite(call, kind):
                 check_finite(both, CALLS[call], arguments)
 
 
-@pytest.mark.parametrize("hole", [0.0, -1.0, np.nan, np.inf])
+@first("hole", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.full
 def test_derivatives_beside_a_hole_are_the_difference_quotients(hole):
     function = CALLS["warp"]
     arguments = (*with_hole(hole, "block"), camera(), TARGETS["moved"])
@@ -218,16 +220,14 @@ def test_derivatives_beside_a_hole_are_the_difference_quotients(hole):
         jnp.where(known, along[1], 0),
         *along[2:],
     )
-    step = quick_jit(
-        lambda s: function(*jax.tree.map(lambda x, v: x + s * v, arguments, along))
-    )
+    step = jax.jit(lambda s: function(*jax.tree.map(lambda x, v: x + s * v, arguments, along)))
     quotient = (step(1e-7) - step(-1e-7)) / 2e-7
     # Where a pixel passes from one patch to the next, or is lost, the quotient is not it.
     assert np.isclose(pushed, quotient, rtol=1e-4, atol=1e-4).mean() > 0.95
 
 
-@pytest.mark.parametrize("surface", ["texel", "bilinear"])
-@pytest.mark.parametrize("method", ["pyramid", "linear"])
+@first("surface", ["texel", "bilinear"])
+@first("method", ["pyramid", "linear"])
 def test_a_miss_makes_no_derivative_of_a_search_infinite(surface, method):
     search = lambda depth, origin, direction: (
         intersect(depth, origin, direction, surface=surface, method=method).position

@@ -12,10 +12,8 @@ import pytest
 from benchmarks.scenes.reproject import run, slanted_rays
 from jaxfx.reproject import _walk, intersect
 from tests.cases.reproject import awkward_rays, field, grid_walk
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 METHODS = ("pyramid", "descent", "linear", "relief")
 
@@ -35,6 +33,7 @@ def check_exact(hit, depth, origin, direction, tolerance):
 
 
 @pytest.mark.parametrize(("count", "together"), [(9000, _walk._TOGETHER), (9001, 4000)])
+@pytest.mark.full
 def test_many_rays_go_on_in_parts_and_thirds(count, together, monkeypatch):
     # Of another number, or JAX would take the program that it has traced before.
     monkeypatch.setattr(_walk, "_TOGETHER", together)
@@ -48,6 +47,7 @@ def test_many_rays_go_on_in_parts_and_thirds(count, together, monkeypatch):
     assert check_exact(some, depth, origin[pick], direction[pick], 1e-9) > 100
 
 
+@pytest.mark.full
 def test_under_vmap_every_ray_finds_the_same_in_as_many_steps():
     rng = np.random.default_rng(6)
     depths = np.stack([field((17, 13), rng) for _ in range(3)])
@@ -93,7 +93,7 @@ def test_bilinear_meets_a_plane_where_it_is():
     np.testing.assert_allclose(z[inner], (0.3 + 0.02 * x + 0.01 * y)[inner], atol=1e-9)
 
 
-@pytest.mark.parametrize("surface", ["texel", "bilinear"])
+@first("surface", ["texel", "bilinear"])
 def test_the_derivative_is_that_of_the_closed_form(surface):
     """A ray on a texel's top or on a plane: t = (D - z) / dz, or (D(o) - z) / (dz - D' d)."""
     depth, origin = jnp.asarray(plane(8)), jnp.array([4.3, 4.1, 0.0])
@@ -111,7 +111,7 @@ def test_the_derivative_is_that_of_the_closed_form(surface):
 
     arguments = depth, origin, direction
 
-    @quick_jit
+    @jax.jit
     def derivatives(*arguments):
         (found, ours), (wanted, theirs) = (
             jax.value_and_grad(of, argnums=(0, 1, 2))(*arguments) for of in (time, expected)
@@ -142,6 +142,7 @@ def test_a_hit_on_a_side_moves_with_the_ray_and_not_with_depth():
     assert not jax.jacobian(hit)(depth, origin).any()
 
 
+@pytest.mark.full
 def test_a_miss_and_a_slanting_ray_have_finite_derivatives():
     depth = jnp.full((4, 4), 0.5)
     origin = jnp.array([[9.0, 9.0, 0.0], [0.2, 0.2, 0.5], [1.0, 1.0, 0.7]])
@@ -150,7 +151,7 @@ def test_a_miss_and_a_slanting_ray_have_finite_derivatives():
         hit = run(depth, origin, direction, surface=surface)
         np.testing.assert_array_equal(hit.mask, [False, True, True])
         total = lambda *x, surface=surface: jnp.sum(run(*x, surface=surface).position)
-        moved = quick_jit(jax.grad(total, argnums=(0, 1, 2)))(depth, origin, direction)
+        moved = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(depth, origin, direction)
         assert all(np.isfinite(m).all() for m in moved)
 
 

@@ -3,9 +3,7 @@
 import pytest
 
 from benchmarks.scenes.reproject import cliff, error_rate, posts
-
-
-pytestmark = pytest.mark.usefixtures("quick")
+from tests.helpers.forms import first
 
 
 # From view to grazing: at least so often the method errs on posts, and on a cliff.
@@ -21,11 +19,12 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("method", "steps", "make", "slope", "least"), FAILURES)
+@pytest.mark.full
 def test_where_a_quick_method_fails(method, steps, make, slope, least):
     assert error_rate(make(48), slope, method, steps) > least
 
 
-@pytest.mark.parametrize("method", ["linear", "relief"])
+@first("method", ["linear", "relief"])
 def test_more_steps_err_less(method):
     rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 64)]
     assert rates[0] > 2 * rates[1]

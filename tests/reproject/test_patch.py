@@ -9,9 +9,6 @@ from scipy import ndimage
 from jaxfx.reproject._patch import patch
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
 def test_a_surface_without_a_step_is_read_as_scipy_reads_it():
     rng = np.random.default_rng(0)
     depth, image = -rng.uniform(0.4, 0.5, (7, 9)), rng.random((7, 9, 3))
@@ -34,6 +31,7 @@ def test_a_texel_of_another_surface_has_no_share():
     np.testing.assert_allclose(found.read_colors(image)[:, 0], [10 * 0.6 + 30 * 0.4, 20])
 
 
+@pytest.mark.full
 def test_its_derivatives_are_difference_quotients():
     rng = np.random.default_rng(1)
     depth, image = -rng.uniform(0.4, 0.5, (6, 6)), jnp.asarray(rng.random((6, 6, 2)))

@@ -2,14 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from benchmarks.scenes.reproject import camera
 from jaxfx import OrthographicCamera
 from jaxfx.reproject._rays import view_rays
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 HEIGHT, WIDTH = 24, 32
 POSE = camera(at=(0.7, 0.2, -0.4), turn=0.3).world_from_camera
@@ -21,7 +19,7 @@ TARGETS = {
 }
 
 
-@pytest.mark.parametrize("kind", TARGETS)
+@first("kind", TARGETS)
 def test_a_ray_is_the_line_that_its_pixel_sees(kind):
     """Each point of a ray, put back into the world, is seen by the target at its pixel."""
     source, target = camera(), TARGETS[kind]

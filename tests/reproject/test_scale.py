@@ -5,9 +5,8 @@ import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera
 from jaxfx.reproject import blend, choose, warp
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 HEIGHT, WIDTH, FOCAL = 16, 20, 24.0
 LENS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -55,9 +54,10 @@ def on_plane(matrix, distance, is_orthographic):
     return FOCAL * points[..., :2] / distance + [WIDTH / 2, HEIGHT / 2], depth > 0
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@first("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("stray", [None, 1e-4, 1e-9])
 @pytest.mark.parametrize("distance", [1e-6, 1.0, 1e3, 1e10, 1e20, 1e37])
+@pytest.mark.full
 def test_a_plane_at_any_distance_and_with_a_stray_pixel_before_it(distance, stray, dtype):
     image, depth = np.stack([X, Y], axis=-1).astype(dtype), np.full(X.shape, distance, dtype)
     clear, low = np.ones(X.shape, bool), -2e-3
@@ -87,6 +87,7 @@ def test_a_plane_at_any_distance_and_with_a_stray_pixel_before_it(distance, stra
 
 
 @pytest.mark.parametrize("sky", [1e7, 1e10, 1e20, 1e37])
+@pytest.mark.full
 def test_a_far_sky_is_the_sky(sky):
     """In `warp`, `blend` and `choose`, as one at infinity, which a test of its own holds."""
     rng = np.random.default_rng(0)

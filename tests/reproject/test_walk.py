@@ -10,9 +10,6 @@ from jaxfx.reproject._walk import level_of, pack, unpack
 from tests.cases.reproject import awkward_rays, field
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
 def test_a_state_is_one_integer_that_keeps_all_five():
     rng = np.random.default_rng(0)
     most = (2**13, 2**13, 16, 2, 2)
@@ -39,6 +36,7 @@ def test_a_bound_on_steps_is_kept_and_said():
 
 
 @pytest.mark.parametrize("method", ["pyramid", "linear", "relief"])
+@pytest.mark.full
 def test_rays_from_their_end_meet_what_they_meet_from_their_start(method):
     """Those that run away are given by where they are at time 0, and begin at -1. (Where the
     descent begins, on the border of the image, rounding decides.)"""
@@ -61,6 +59,7 @@ def test_rays_from_their_end_meet_what_they_meet_from_their_start(method):
     assert expected.mask.sum() > 30 and not found.time[~found.mask].any()
 
 
+@pytest.mark.full
 def test_a_ray_that_comes_in_at_an_edge_is_inside_whatever_rounding_says():
     """Rays from the right edge of the image to where they end, in it, in float32."""
     rng = np.random.default_rng(3)

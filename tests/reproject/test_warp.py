@@ -12,10 +12,7 @@ from benchmarks.scenes import reproject as cases
 from benchmarks.scenes.reproject import camera
 from jaxfx import OrthographicCamera, PinholeCamera, scene
 from jaxfx.reproject import warp
-from tests.helpers.quick import quick_jit
-
-
-pytestmark = pytest.mark.usefixtures("quick")
+from tests.helpers.forms import first
 
 
 def picture(height=24, width=32):
@@ -23,7 +20,7 @@ def picture(height=24, width=32):
     return np.stack([np.sin(7 * x + y), np.cos(5 * y - x), x * y], axis=-1) + 1.5
 
 
-@pytest.mark.parametrize("method", ["descent", "linear"])
+@first("method", ["descent", "linear"])
 def test_the_same_camera_gives_the_same_picture(method):
     """In float32. That of "pyramid", in both types, is asked in `tests/stability`."""
     rng = np.random.default_rng(0)
@@ -37,7 +34,7 @@ def test_the_same_camera_gives_the_same_picture(method):
     assert drawn.dtype == alpha.dtype == np.float32
 
 
-@pytest.mark.parametrize("move", [(0.3, 0.1, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5)])
+@first("move", [(0.3, 0.1, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5)])
 def test_a_plane_moves_by_its_homography(move):
     """A linear picture of a fronto-parallel plane, read where the plane's points project to."""
     y, x = np.mgrid[:24, :32] + 0.5
@@ -63,7 +60,7 @@ def test_from_its_own_camera_a_plane_has_the_derivative_of_its_homography():
         pose = eye.world_from_camera.at[:3, 3].add(move)
         return warp(image, depth, eye, PinholeCamera(eye.intrinsics, pose))[0]
 
-    jacobian = np.asarray(quick_jit(jax.jacfwd(drawn))(jnp.zeros(3)))
+    jacobian = np.asarray(jax.jit(jax.jacfwd(drawn))(jnp.zeros(3)))
     focal = float(eye.intrinsics[0, 0])
     # Pixel u sees f X / Z + c of the source, with X = (u - c) / f * (Z - move[2]) + move[0].
     forward = -(image - [16, 12]) / 2
@@ -119,6 +116,7 @@ def test_holes_are_not_read_and_do_not_spread():
 
 
 @pytest.mark.parametrize("threshold", [0.1, 3.0])
+@pytest.mark.full
 def test_a_cliff_opens_a_gap_unless_it_counts_as_one_surface(threshold):
     image, depth = picture(), np.full((24, 32), 4.0)
     depth[:, 16:] = 2.0
@@ -132,6 +130,7 @@ def test_a_cliff_opens_a_gap_unless_it_counts_as_one_surface(threshold):
     assert gap == (0 if threshold == 3.0 else pytest.approx(0.4 * focal / 4, abs=1.0))
 
 
+@pytest.mark.full
 def test_the_still_life_turned_against_the_still_life_rendered():
     source, photograph = cases.photographer(scene.still_life(), 96)
     image, depth = photograph(source)
@@ -167,6 +166,7 @@ def smooth_depth():
     return 2 + 0.1 * np.sin(4 * x) * np.cos(3 * y)
 
 
+@pytest.mark.full
 def test_derivatives_of_the_pose_and_the_depth_are_the_difference_quotients():
     image, depth = picture(), smooth_depth()
     source = camera()
@@ -176,7 +176,7 @@ def test_derivatives_of_the_pose_and_the_depth_are_the_difference_quotients():
         target = PinholeCamera(source.intrinsics, pose)
         return warp(image, depth, source, target)[0][6:18, 8:24]
 
-    @quick_jit
+    @jax.jit
     def derivatives(along, weight):
         step = lambda s: drawn(s * along[0], depth + s * along[1])
         at = (jnp.zeros(3), jnp.asarray(depth))
@@ -197,6 +197,7 @@ def test_derivatives_of_the_pose_and_the_depth_are_the_difference_quotients():
         assert float(product) == pytest.approx(float(jnp.vdot(weight, pushed)), rel=1e-9)
 
 
+@pytest.mark.full
 def test_under_vmap_and_in_any_shape():
     image, depth = picture(), smooth_depth()
     moves = jnp.array([[0.1, 0, 0], [0, 0.2, 0.1]])
@@ -206,9 +207,9 @@ def test_under_vmap_and_in_any_shape():
         target = PinholeCamera(camera(5, 7).intrinsics, pose)
         return warp(image, depth, camera(), target, shape=(5, 7))
 
-    images, alphas = quick_jit(jax.vmap(drawn))(moves)
+    images, alphas = jax.jit(jax.vmap(drawn))(moves)
     assert images.shape == (2, 5, 7, 3) and alphas.shape == (2, 5, 7)
-    single = quick_jit(drawn)
+    single = jax.jit(drawn)
     for move, image_, alpha in zip(moves, images, alphas, strict=True):
         one, mask = single(move)
         np.testing.assert_allclose(image_, one, atol=1e-12)

@@ -28,6 +28,7 @@ def test_sizes_and_scenes_may_change_from_call_to_call(backend):
             assert np.mean(np.isfinite(depth) == np.isfinite(other)) > 0.99
 
 
+@pytest.mark.full
 def test_a_scene_that_is_gone_makes_room(backend, ball):
     """Buffers belong to a scene, not to the place in memory where it was."""
     view = scene.default_camera(ball, **SIZE)
@@ -119,6 +120,7 @@ def test_wider_than_opengl_draws_at_once(backend, straight, height, width):
     np.testing.assert_array_equal(ids, np.broadcast_to(expected, (height, width)))
 
 
+@pytest.mark.full
 def test_without_embree_and_opengl(fresh_python):
     printed, complaint = fresh_python(
         "complain('embree'); complain('auto')",
@@ -135,6 +137,7 @@ def test_without_embree_and_opengl(fresh_python):
     ("without", "environment"),
     [((), {"PYOPENGL_PLATFORM": "nonsense"}), (("pyrender",), {}), (("OpenGL",), {})],
 )
+@pytest.mark.full
 def test_without_opengl(fresh_python, without, environment):
     """Embree is taken and said once; OpenGL, asked for, is refused; the variable stays."""
     printed, complaint = fresh_python(
@@ -151,6 +154,7 @@ def test_without_opengl(fresh_python, without, environment):
     assert complaint == ""
 
 
+@pytest.mark.full
 def test_with_opengl_auto_takes_it_and_exits_quietly(both_backends, fresh_python):
     printed, complaint = fresh_python(
         "depth('embree')\n"

@@ -45,6 +45,7 @@ def ball():
     return built([inside], camera, points=400, rank=400)[2]
 
 
+@pytest.mark.full
 def test_an_enclosure_gets_what_it_sends(ball):
     """In a sphere every share is the point's part of the surface, wherever the pixel is."""
     shares = np.asarray(ball.receive @ ball.send)
@@ -54,11 +55,13 @@ def test_an_enclosure_gets_what_it_sends(ball):
     np.testing.assert_allclose(shares @ uneven, 1, atol=0.05)
 
 
+@pytest.mark.full
 def test_one_singular_vector_says_all_of_a_sphere(ball):
     first = np.asarray(ball.receive[..., :1] @ ball.send[:1])
     np.testing.assert_allclose(first.sum(axis=-1), 1, atol=0.03)
 
 
+@pytest.mark.full
 def test_singular_vectors_are_orthonormal_and_the_largest_come_first(ball):
     np.testing.assert_allclose(ball.send @ ball.send.T, np.eye(400), atol=1e-5)
     strength = np.linalg.norm(np.asarray(ball.receive).reshape(-1, 400), axis=0)

@@ -21,8 +21,6 @@ from jaxfx._sampling import pixel_centers
 from .conftest import naive_pcf
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
 SIDE, MAP, WHITE = 40, 48, [1.0, 1.0, 1.0]
 POINT = np.array([0.0, 1.0, 4.0])
 LIGHTS = {
@@ -80,6 +78,7 @@ def on_a_plane(light, tilt, dtype, eye=None, turn=0.4):
 
 @pytest.mark.parametrize("tilt", [0.0, 0.8, 1.2])
 @pytest.mark.parametrize("name", LIGHTS)
+@pytest.mark.full
 def test_a_plane_is_lit_by_every_method(name, tilt):
     """In float32, whose rounding tells nearest from next; the sine of its grazing is 0.02."""
     shadow_map, seen, camera, inside = on_a_plane(LIGHTS[name], tilt, np.float32)
@@ -92,6 +91,7 @@ def test_a_plane_is_lit_by_every_method(name, tilt):
             assert visible.min() >= 1 - 1e-6, (method, size)
 
 
+@pytest.mark.full
 def test_receivers_between_texels_are_lit_too():
     """Pixels' centres on the borders of texels, where a filter's far corner is farthest."""
     up = PinholeCamera.look_at([0, -2, 4], POINT, up=[0, 0, 1], fov_y=1, height=4, width=4)
@@ -164,6 +164,7 @@ def test_a_shadow_loses_its_foot_by_less_than_the_filter(steep, wall, turn):
         ),
     ],
 )
+@pytest.mark.full
 def test_derivatives_by_the_default_are_differences(case, method):
     shadow_map, receivers = jax.tree.map(jnp.asarray, case)
     rng = np.random.default_rng(3)
@@ -185,6 +186,7 @@ def test_derivatives_by_the_default_are_differences(case, method):
     assert pulled == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.full
 def test_a_plan_keeps_the_bias_of_the_full_filter():
     """Its smaller filters differ in size alone: a plane stays lit, and the error is kept."""
     shadow_map, seen, _, inside = on_a_plane(LIGHTS["low sun"], 0.8, np.float64)

@@ -3,12 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxfx.shadow import _compact
-
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 
 def test_comparisons_are_counted_where_they_are_made():

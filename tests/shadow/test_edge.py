@@ -14,17 +14,13 @@ import pytest
 from benchmarks.scenes.shadow import noise, plate, steps
 from jaxfx import shadow
 from jaxfx.shadow.edge import usual_dilation
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
 from .conftest import naive_pcf
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
-@pytest.mark.parametrize(
-    ("kernel", "softness"), [("box", 0.2), ("tent", None), ("gaussian", 0.2)]
-)
+@first(("kernel", "softness"), [("box", 0.2), ("tent", None), ("gaussian", 0.2)])
+@pytest.mark.full
 def test_depth_mask_is_pcf_in_every_form(kernel, softness):
     case = steps(3)
     options = {"size": 5, "kernel": kernel, "softness": softness, "bias": 0.02}
@@ -114,6 +110,7 @@ def test_the_mask_by_depth_is_the_default_and_needs_no_dilation(case):
     assert default.comparisons == depth.comparisons
 
 
+@pytest.mark.full
 def test_derivatives_are_pcfs():
     shadow_map, receivers = noise()
     options = {"size": 3, "kernel": "tent"}
@@ -125,7 +122,7 @@ def test_derivatives_are_pcfs():
     at = (jnp.asarray(shadow_map), jnp.asarray(receivers.z), 0.05, 0.3)
     exact = ft.partial(shadow.edge_pcf, mask="depth")
     found, expected = (
-        quick_jit(jax.grad(ft.partial(loss, function), argnums=(0, 1, 2, 3)))(*at)
+        jax.jit(jax.grad(ft.partial(loss, function), argnums=(0, 1, 2, 3)))(*at)
         for function in (exact, shadow.pcf)
     )
     for one, other in zip(found, expected, strict=True):

@@ -8,10 +8,8 @@ import pytest
 
 from benchmarks.scenes.shadow import noise
 from jaxfx import OrthographicCamera, PinholeCamera, shadow
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 LIGHT = PinholeCamera.from_fov(0.8, height=24, width=24)
 SOFT = {"size": 3, "softness": 0.3}
@@ -25,7 +23,7 @@ FILTERS = {
 }
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@first("name", FILTERS)
 def test_a_missing_texel_is_as_one_where_nothing_is(name):
     shadow_map, receivers = noise()
     lost = np.random.default_rng(0).random(shadow_map.shape) < 0.2
@@ -37,7 +35,7 @@ def test_a_missing_texel_is_as_one_where_nothing_is(name):
     assert np.isfinite(found).all()
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@first("name", FILTERS)
 def test_no_derivative_is_lost_to_one_bad_texel_or_receiver(name):
     """In the map, the receivers and both biases: finite, and alike in both modes."""
     shadow_map, receivers = noise()
@@ -61,7 +59,7 @@ def check_both_modes(function, arguments):
     rng = np.random.default_rng(0)
     like = lambda tree: jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), tree)
 
-    @quick_jit
+    @jax.jit
     def both(arguments, along, weight):
         value, pushed = jax.jvp(function, arguments, along)
         pulled = jax.vjp(function, *arguments)[1](weight)
@@ -78,6 +76,7 @@ def check_both_modes(function, arguments):
 
 
 @pytest.mark.parametrize("kind", ["pinhole", "orthographic"])
+@pytest.mark.full
 def test_no_derivative_of_receivers_is_lost_to_a_hole(kind):
     """With normals that are no numbers there, which nobody reads."""
     camera = PinholeCamera.from_fov(0.7, height=6, width=8)
@@ -137,6 +136,7 @@ def test_a_slope_far_from_the_origin():
 
 
 @pytest.mark.parametrize("sky", [1e7, 1e10, 1e20, 1e37])
+@pytest.mark.full
 def test_a_far_sky_in_a_map_of_moments_changes_nothing_away_from_it(sky):
     """A variance shadow map in float32, whose unit is that of all depths."""
     shadow_map = np.full((20, 20), 5, np.float32)

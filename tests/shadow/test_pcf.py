@@ -9,12 +9,10 @@ import pytest
 
 from benchmarks.scenes.shadow import noise
 from jaxfx import shadow
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
 from .conftest import naive_pcf
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 KERNELS = ("box", "tent", "gaussian")
 
@@ -161,7 +159,7 @@ def test_weights_that_follow_the_receiver_are_continuous(kernel):
     assert max(abs(at(x - 1e-9, "box") - at(x + 1e-9, "box")) for x in range(3, 14)) > 0.01
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@first("kernel", KERNELS)
 def test_gradients_of_soft_forms(case, kernel):
     shadow_map, receivers = case
     weight = np.random.default_rng(5).normal(size=receivers.z.shape)
@@ -172,7 +170,7 @@ def test_gradients_of_soft_forms(case, kernel):
             weight * shadow.pcf(shadow_map, receivers, size=3, kernel=kernel, **options)
         )
 
-    both = quick_jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3, 4)))
+    both = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3, 4)))
     for softness in (0.03, 1.0):
         at = jax.tree.map(jnp.asarray, (shadow_map, receivers, 0.05, 0.4, softness))
         check_along_random_directions(lambda *at: both(*at)[0], at, both(*at)[1])
@@ -205,5 +203,5 @@ def test_hard_forms_have_zero_gradients(case):
             return jnp.sum(function(shadow_map, receivers, bias=bias, slope_bias=bias))
 
         arguments = jax.tree.map(jnp.asarray, (*case, 0.1))
-        for leaf in jax.tree.leaves(quick_jit(jax.grad(loss, argnums=(0, 1, 2)))(*arguments)):
+        for leaf in jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1, 2)))(*arguments)):
             np.testing.assert_array_equal(leaf, 0)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, shadow
-from tests.helpers.quick import quick_jit
 
 
 SIDE = 128
@@ -74,7 +73,7 @@ def test_reverse_mode_matches_differences():
         return jnp.sum(shadow.pcss(shadow_map, moved, camera, **options) ** 2)
 
     at = tuple(map(jnp.asarray, (0.1, 0.123, 0.3)))
-    both = quick_jit(jax.value_and_grad(loss, argnums=(0, 1, 2)))
+    both = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2)))
     for index, slope in enumerate(both(*at)[1]):
         ahead, behind = (
             both(*(x + s * (i == index) for i, x in enumerate(at)))[0] for s in (1e-6, -1e-6)

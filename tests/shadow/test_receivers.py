@@ -9,10 +9,8 @@ import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, shadow
 from jaxfx._sampling import pixel_centers
-from tests.helpers.quick import quick_jit
+from tests.helpers.forms import first
 
-
-pytestmark = pytest.mark.usefixtures("quick")
 
 HEIGHT, WIDTH = 6, 7
 
@@ -45,7 +43,7 @@ def on_plane(camera, normal, point):
     return ((point - start) @ normal) / (ray @ normal)
 
 
-@pytest.mark.parametrize("light", [sun_camera(), spot_camera()])
+@first("light", [sun_camera(), spot_camera()])
 def test_receivers_are_the_points_in_the_lights_space(light):
     camera = eye_camera()
     depth = np.random.default_rng(0).uniform(2, 5, (HEIGHT, WIDTH))
@@ -64,8 +62,8 @@ def test_a_sequence_of_one_camera_is_that_camera(light):
     assert all(np.array_equal(a, b) for a, b in zip(one, same, strict=True))
 
 
-@pytest.mark.parametrize("light", [sun_camera(), spot_camera()])
-@pytest.mark.parametrize("is_given", [False, True])
+@first("light", [sun_camera(), spot_camera()])
+@first("is_given", [False, True])
 def test_the_slope_is_the_change_of_depth_from_texel_to_texel(light, is_given):
     camera, normal = eye_camera(), np.array([0.2, -1.0, 0.1])
     depth = on_plane(camera, normal, np.array([0.0, 1.0, 0.0]))
@@ -130,6 +128,7 @@ def test_a_pixel_that_shows_nothing_is_outside_of_every_map(bad):
         assert not changed.any()
 
 
+@pytest.mark.full
 def test_points_beside_and_behind_the_light_have_finite_gradients():
     """The middle row lies in the light's own plane, where a projection divides by 0."""
     camera = OrthographicCamera(1.0, [2.5, 2.5], np.eye(4))
@@ -144,7 +143,7 @@ def test_points_beside_and_behind_the_light_have_finite_gradients():
     found = shadow.receivers(depth, camera, light)
     np.testing.assert_array_equal(found.z[2:], -1)
     assert (np.asarray(found.z[:2]) > 0).all()
-    for leaf in jax.tree.leaves(quick_jit(jax.grad(loss, argnums=(0, 1)))(depth, light)):
+    for leaf in jax.tree.leaves(jax.jit(jax.grad(loss, argnums=(0, 1)))(depth, light)):
         assert np.isfinite(leaf).all()
 
 
@@ -161,6 +160,7 @@ SOFT = {
 
 
 @pytest.mark.parametrize("form", SOFT.values(), ids=SOFT)
+@pytest.mark.full
 def test_derivatives_reach_depth_and_light_through_every_soft_form(form):
     """Forward, as the shorter program; that reverse agrees is shown part by part elsewhere."""
     rng = np.random.default_rng(4)
@@ -171,7 +171,7 @@ def test_derivatives_reach_depth_and_light_through_every_soft_form(form):
         return jnp.sum(form(shadow_map, seen, light, size=3, bias=0.1, slope_bias=0.1) ** 2)
 
     at = jnp.asarray(rng.uniform(2, 4, (HEIGHT, WIDTH))), spot_camera()
-    program = quick_jit(lambda at, along: jax.jvp(total, at, along))
+    program = jax.jit(lambda at, along: jax.jvp(total, at, along))
     zeros = jax.tree.map(jnp.zeros_like, at)
     for index, value in enumerate(at):
         some = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), value)

@@ -8,9 +8,6 @@ import pytest
 from jaxfx.shadow import _taps
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
 def test_a_soft_comparison_is_a_smoothstep_about_the_threshold():
     texel, threshold, softness = np.linspace(0, 2, 41), np.full(41, 1.0), 0.5
     along = np.clip((texel - threshold) / softness + 0.5, 0, 1)

@@ -15,6 +15,7 @@ def stage():
     return Still()
 
 
+@pytest.mark.full
 def test_acne_falls_and_leaks_grow_with_both_biases(stage):
     """Ten units across, 512 texels. Half of all is acne without a bias."""
     data, truth = stage.under_the_sun(512), stage.truth(-Still.sun)
@@ -39,6 +40,7 @@ def test_acne_falls_and_leaks_grow_with_both_biases(stage):
     assert leaks[3, 0] > 0.15
 
 
+@pytest.mark.full
 def test_a_finer_map_errs_less(stage):
     clear, facing = stage.truth(-Still.sun)
     wrong = []
@@ -50,6 +52,7 @@ def test_a_finer_map_errs_less(stage):
     assert wrong[2] < 0.004
 
 
+@pytest.mark.full
 def test_six_faces_about_a_lamp(stage):
     cameras = shadow.light_cameras(PointLight(Still.lamp, WHITE), map_size=256, margin=4)
     visible = shadow.hard(*stage.compared(cameras, 256), slope_bias=0.5)
@@ -58,6 +61,7 @@ def test_six_faces_about_a_lamp(stage):
     assert np.mean((np.asarray(visible) != clear)[facing]) < 0.015
 
 
+@pytest.mark.full
 def test_a_square_lamps_penumbra(stage):
     """36 shadow rays a point; `pcss` halves the error of the hard shadow, `pcf` does not."""
     light_size = 0.2

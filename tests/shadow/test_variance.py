@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from jaxfx import shadow
-from tests.helpers.quick import quick_jit
 
 
 def at(u, v, z):
@@ -59,7 +58,7 @@ def test_reverse_mode_matches_differences(case):
         return jnp.sum(shadow.variance(*data, size=3, bias=bias) ** 2)
 
     arguments = (receivers.u, jnp.asarray(0.1))
-    both = quick_jit(jax.value_and_grad(loss, argnums=(0, 1)))
+    both = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
     slopes, step = both(*arguments)[1], 1e-6
     ahead, behind = (both(*(x + s for x in arguments))[0] for s in (step, -step))
     expected = float(ahead - behind) / (2 * step)

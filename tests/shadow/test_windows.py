@@ -3,16 +3,15 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxfx.shadow._windows import extremes, unions
+from tests.helpers.forms import first
 
 
-pytestmark = pytest.mark.usefixtures("quick")
-
-
-@pytest.mark.parametrize(
-    ("shape", "size"), [((3, 3), 3), ((7, 9), 7), ((20, 23), 1), ((20, 23), 3), ((25, 23), 21)]
+@first(
+    ("shape", "size"),
+    [((3, 3), 3), ((7, 9), 7), ((20, 23), 1), ((20, 23), 3), ((25, 23), 21)],
+    2,
 )
 def test_running_extremes(shape, size):
     image = np.random.default_rng(0).normal(size=shape)

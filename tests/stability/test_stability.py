@@ -13,7 +13,7 @@ import pytest
 from benchmarks import stability
 
 
-pytestmark = pytest.mark.stability
+pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("optimised")]
 
 CASES = {effect: stability.registered(effect) for effect in stability.EFFECTS}
 
