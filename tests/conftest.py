@@ -20,6 +20,9 @@ MANY_MAPS = 20_000
 # Whole folders that only `--full` runs; single tests carry the marker `full`.
 FULL_FOLDERS = {"examples", "stability"}
 
+# The file that takes longest is begun first, or one process would end with it alone.
+LONGEST = "test_transforms.py"
+
 
 def pytest_addoption(parser):
     parser.addoption(
@@ -61,6 +64,16 @@ def pytest_collection_modifyitems(config, items):
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
+    items.sort(key=lambda item: item.path.name != LONGEST)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Spread files over processes, so that what a file's tests share is computed once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False  # It would begin with files of many quick tests.
+    return LoadFileScheduling(config, log)
 
 
 @pytest.fixture(scope="session")

@@ -221,6 +221,7 @@ def test_sigma_0_is_the_identity_with_a_gradient_of_0(sampling):
         np.testing.assert_array_equal(slope, 0)
 
 
+@pytest.mark.full
 def test_gradients_in_sigma_and_the_image_are_differences():
     image, bar = (jnp.asarray(picture(14, 12, c)[..., :2]) for c in (2, 3))
 

@@ -241,6 +241,7 @@ def test_the_image_guides():
     assert np.mean((blind.depth < 2) == is_disc) < 0.98
 
 
+@pytest.mark.full
 def test_the_shadow_beside_a_near_thing_is_behind_it():
     """In grey alone, where the image says nothing, the farther side of the gap goes on."""
     is_disc, values, _ = scene()
@@ -279,6 +280,7 @@ def test_what_is_known_stays_and_depths_are_copied():
         np.testing.assert_array_equal(found.filled, missing)
 
 
+@pytest.mark.full
 def test_a_sky_alone():
     values = np.array([[INF, NAN], [NAN, 1e10]])
     for method in ("rows", "guided"):
@@ -286,6 +288,7 @@ def test_a_sky_alone():
 
 
 @first("method", ["rows", "guided"])
+@pytest.mark.full
 def test_a_slope_goes_to_the_depth_that_is_copied(method):
     rng = np.random.default_rng(3)
     values = rng.uniform(1, 9, (7, 8))

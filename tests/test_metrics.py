@@ -71,7 +71,7 @@ def highlights(rng):
 PAIRS = [noise, ramp_and_edge, flat, opposite, highlights]
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@first("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("pair", PAIRS)
 def test_psnr_equals_scikit_image(rng, pair, dtype):
     image, reference = (a.astype(dtype) for a in pair(rng))
@@ -84,7 +84,7 @@ def test_psnr_equals_scikit_image(rng, pair, dtype):
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@first("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("pair", PAIRS)
 def test_ssim_equals_scikit_image(rng, pair, dtype, window):
     image, reference = (a.astype(dtype) for a in pair(rng))
@@ -97,6 +97,7 @@ def test_ssim_equals_scikit_image(rng, pair, dtype, window):
 @first("window", WINDOWS)
 @hyp.given(st.integers(11, 26), st.integers(11, 26), st.integers(1, 4), st.integers(0, 2**32))
 @hyp.settings(max_examples=5, deadline=None)
+@pytest.mark.full
 def test_ssim_of_any_size(window, height, width, channels, seed):
     rng = np.random.default_rng(seed)
     image, reference = rng.random((2, height, width, channels))

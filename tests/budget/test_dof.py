@@ -159,6 +159,7 @@ def test_a_wrong_argument_is_refused(options, message):
         inspect.unwrap(budget.dof)(*data, **options)
 
 
+@pytest.mark.full
 def test_a_plan_is_made_outside_of_transforms():
     image, depth, lens = scene(np.random.default_rng(3), 9.9)
     with pytest.raises(ValueError, match="must be given concrete data"):

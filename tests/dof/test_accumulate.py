@@ -227,6 +227,7 @@ def test_faults_name_the_argument():
         (np.float32, 0.1, np.float32),
     ],
 )
+@pytest.mark.full
 def test_pictures_of_other_types_are_summed_as_floats(kind, value, result):
     """256 of them: their sum is beyond what bytes and halves hold."""
     picture = np.full((2, 2, 3), value, kind)

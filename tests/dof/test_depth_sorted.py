@@ -153,6 +153,7 @@ def test_beats_scatter_on_an_ordered_scene():
         assert result[1] > 40
 
 
+@pytest.mark.full
 def test_a_blurred_edge_is_as_opaque_as_the_share_of_the_lens_that_it_covers():
     """Exact where scatter, whatever its gamma, is wrong by up to a sixth."""
     radius, columns = 6.0, np.arange(41) + 0.5 - 20

@@ -270,6 +270,7 @@ class Plain:
 
 
 @first("name", METHODS)
+@pytest.mark.full
 def test_a_lens_of_ones_own(name):
     """Like the thin lens whose formula it has, in value and in every derivative."""
     image, depth = (jnp.asarray(x) for x in with_hole())

@@ -121,6 +121,7 @@ def test_a_constant_image_is_kept():
     assert np.abs(two_layers(image, depth, behind) - 0.7).max() < 1e-12
 
 
+@pytest.mark.full
 def test_nothing_changes_in_focus_or_without_an_aperture():
     image, depth = texture(4), np.random.default_rng(4).uniform(1, 5, SIZE)
     closed = ThinLens(0.0, 2.0, 24.0)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxfx.dof._paint import BLOCK, paint, read_back
 from jaxfx.dof._sprites import coverage, row_half_width
@@ -32,6 +33,7 @@ def test_one_disc_is_its_coverage():
         np.testing.assert_allclose(painted, expected, atol=1e-12)
 
 
+@pytest.mark.full
 def test_the_tangent_is_the_difference_quotient():
     (value, radius), dot = discs(0), discs(1)
     dot = dot[0], jnp.where(radius > 0.6, dot[1], 0)
@@ -41,6 +43,7 @@ def test_the_tangent_is_the_difference_quotient():
     np.testing.assert_allclose(tangent, (ends[0] - ends[1]) / (2 * step), atol=2e-6)
 
 
+@pytest.mark.full
 def test_reading_back_is_the_transpose():
     (value, radius), dot = discs(2), discs(3)
     bar = jnp.asarray(np.random.default_rng(4).normal(size=value.shape))

@@ -131,6 +131,7 @@ def largest_step(spacing):
     return np.abs(np.diff(pictures, axis=0)).max()
 
 
+@pytest.mark.full
 def test_radius_zero_to_two_has_no_jump():
     # A jump stays as it is when the sweep is refined; a slope shrinks with its step.
     coarse, fine, finest = map(largest_step, (0.05, 0.025, 0.0125))
@@ -173,6 +174,7 @@ def test_constant_linear_and_mirrored(seed, gamma, epsilon):
 
 @first("shape", [(1, 1, 1), (1, 7, 3), (7, 1, 4), (13, 5, 2)])
 @first("kernel", KERNELS)
+@pytest.mark.full
 def test_any_size(shape, kernel):
     image, depth = random_scene(5, *shape)
     lens = ThinLens(0.1, 2.5, 200.0)

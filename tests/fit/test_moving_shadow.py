@@ -141,6 +141,7 @@ def test_derivatives_against_differences(camera, make, start):
 
 
 @first("missing", [0.0, -1.0, np.nan])
+@pytest.mark.full
 def test_what_is_missing_shadows_nothing_and_spoils_no_derivative(missing):
     """In the map it is as nothing there; in the cache, whose normals then are no numbers."""
     gbuffer = plane()

@@ -177,6 +177,7 @@ def test_a_chain_of_edits_of_several_kinds_does_not_drift():
     assert drift(state) < 1e-6
 
 
+@pytest.mark.full
 def test_ten_thousand_edits_in_a_loop_do_not_drift():
     """The worst chain: the same two lights in turn, so that what is lost is lost each time."""
     one, two, three = make_lights(3, kinds=(point,))
@@ -358,6 +359,7 @@ def painted(gbuffer, **images):
 
 
 @pytest.mark.parametrize("name", ["diffuse", "specular", "roughness"])
+@pytest.mark.full
 def test_paint_gives_the_picture_of_the_new_material(name):
     value = {"roughness": 0.55}.get(name, NEW)
     state = relight.start(GBUFFER, CAMERA, make_lights(5)).paint(MASK, **{name: value})
@@ -387,6 +389,7 @@ def test_painting_reflectances_shades_no_light():
     assert shades(roughness=0.5)
 
 
+@pytest.mark.full
 def test_derivatives_of_paint():
     state = relight.start(GBUFFER, CAMERA, make_lights(3))
     new = {"color": NEW, "diffuse": NEW[::-1], "specular": NEW, "roughness": np.array(0.6)}

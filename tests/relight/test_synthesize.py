@@ -256,6 +256,7 @@ def test_a_scene_of_any_scale_gives_the_same_view(scale):
     np.testing.assert_allclose(other.color, one.color, atol=1e-6)
 
 
+@pytest.mark.full
 def test_detail_favours_the_camera_that_is_nearer():
     near = PinholeCamera.look_at(
         [0, 0, 2], [0, 0, 3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH

@@ -27,6 +27,7 @@ def box_before_a_wall(eye):
     return np.where(on_box, 1.0, 0.25)[None, :, None] * np.ones((16, 24, 3)), depth
 
 
+@pytest.mark.full
 def test_two_sources_fill_each_others_gaps():
     eyes = [camera(-0.5), camera(0.5)]
     images, depths = zip(*map(box_before_a_wall, eyes), strict=True)

@@ -48,6 +48,7 @@ def splat(depth_at, shape, source, target):
 
 
 @pytest.mark.parametrize("hole", [*MISSING, np.inf])
+@pytest.mark.full
 def test_a_stereo_pair_draws_its_own_pixels_and_no_pixel_of_a_hole(hole):
     """The plane keeps its pixels in the other view, so that the hole does."""
     height, width, focal, distance, baseline = 8, 96, 995.0, 2.75, 0.193
@@ -110,6 +111,7 @@ def test_the_colour_before_a_hole_is_its_own_pixels():
         np.testing.assert_array_equal(np.asarray(alpha)[:, 8:], 0)
 
 
+@pytest.mark.full
 def test_a_search_that_starts_on_a_border_of_texels_behind_a_wall_has_seen_nothing():
     """From behind, rays come into the frustum beyond the wall: on a texel's border, some."""
     depth, image = np.full((16, 20), 2.0), np.ones((16, 20, 1))

@@ -94,6 +94,7 @@ def test_bilinear_meets_a_plane_where_it_is():
 
 
 @first("surface", ["texel", "bilinear"])
+@pytest.mark.full
 def test_the_derivative_is_that_of_the_closed_form(surface):
     """A ray on a texel's top or on a plane: t = (D - z) / dz, or (D(o) - z) / (dz - D' d)."""
     depth, origin = jnp.asarray(plane(8)), jnp.array([4.3, 4.1, 0.0])
@@ -129,6 +130,7 @@ def test_the_derivative_is_that_of_the_closed_form(surface):
     assert float(jnp.sum(moved)) == pytest.approx(float(total), abs=1e-9)
 
 
+@pytest.mark.full
 def test_a_hit_on_a_side_moves_with_the_ray_and_not_with_depth():
     depth = jnp.where(jnp.arange(6)[None] < 3, 0.9, 0.2) * jnp.ones((6, 1))
     origin, direction = jnp.array([0.5, 2.5, 0.0]), jnp.array([4.0, 1.0, 1.0])

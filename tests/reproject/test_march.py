@@ -25,6 +25,7 @@ def test_where_a_quick_method_fails(method, steps, make, slope, least):
 
 
 @first("method", ["linear", "relief"])
+@pytest.mark.full
 def test_more_steps_err_less(method):
     rates = [error_rate(posts(48), 16, method, steps) for steps in (4, 64)]
     assert rates[0] > 2 * rates[1]

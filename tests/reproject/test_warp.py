@@ -51,6 +51,7 @@ def test_a_plane_moves_by_its_homography(move):
     assert not np.asarray(drawn)[~np.asarray(inside)].any()
 
 
+@pytest.mark.full
 def test_from_its_own_camera_a_plane_has_the_derivative_of_its_homography():
     """Every pixel reads the centre of a texel, where the three others have a share of 0."""
     y, x = np.mgrid[:24, :32] + 0.5

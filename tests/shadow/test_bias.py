@@ -121,6 +121,7 @@ def test_0_said_outright_is_0(case):
     np.testing.assert_allclose(visible, naive_pcf(*case, 5, 0.0, 0.5), atol=1e-15)
 
 
+@pytest.mark.full
 def test_without_a_bias_a_plane_shadows_itself():
     shadow_map, seen, _, inside = on_a_plane(LIGHTS["low sun"], 0.8, np.float32)
     for size in (3, 9):

@@ -43,6 +43,7 @@ def test_depth_mask_is_where_the_comparisons_differ(size):
 
 
 @pytest.mark.parametrize("magnification", [0.25, 1.0, 8.0])
+@pytest.mark.full
 def test_screen_mask_with_enough_dilation_loses_no_wide_shadow(magnification):
     case = plate(magnification, 16 if magnification < 8 else 6)
     screen = shadow.edge_pcf(*case, size=7, mask="screen")
@@ -60,6 +61,7 @@ def test_a_grazed_surface_does_not_make_the_dilation_the_picture():
     assert found == [4 * 2 + 1] * 2
 
 
+@pytest.mark.full
 def test_screen_mask_misses_less_the_farther_edges_reach():
     case = plate(4.0, 4)
     full = shadow.pcf(*case, size=7)
@@ -72,6 +74,7 @@ def test_screen_mask_misses_less_the_farther_edges_reach():
     assert differing[-1] == 0
 
 
+@pytest.mark.full
 def test_screen_mask_loses_a_shadow_between_pixels():
     """One texel wide, seen at a quarter: pixels step over it, so that it has no edge."""
     shadow_map, receivers = plate(0.25, 1, side=16)

@@ -63,6 +63,7 @@ def test_lit_where_there_is_no_blocker():
     assert (shadow.pcss(empty, receivers, camera, size=15, light_size=0.2) == 1).all()
 
 
+@pytest.mark.full
 def test_reverse_mode_matches_differences():
     camera = PinholeCamera.from_fov(1.0, height=SIDE, width=SIDE)
     shadow_map, receivers, _ = half_plane(camera)

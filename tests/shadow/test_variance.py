@@ -49,6 +49,7 @@ def test_lit_whatever_the_map_says():
     assert shadow.variance(wall, at(2.5, 2, 5), size=1)[0, 0] == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.full
 def test_reverse_mode_matches_differences(case):
     shadow_map, receivers = np.minimum(case[0], 4.0), case[1]
     receivers = jax.tree.map(jnp.asarray, receivers)
