@@ -402,10 +402,10 @@ def _quotient(call, arguments, along):
     return jax.tree.map(lambda a, b: (a - b) / 2e-6, moved(1e-6), moved(-1e-6))
 
 
-@each(CASES)
-def test_reverse_mode_is_the_difference_quotient(case):
+@functools.lru_cache(maxsize=1)
+def pulled(case):
+    """A compiled function to the result, weights on it and their gradient; and arguments."""
     call, arguments = case.split()
-    along = _normal(arguments)
 
     @jax.jit
     def pulled(arguments):
@@ -413,32 +413,30 @@ def test_reverse_mode_is_the_difference_quotient(case):
         weight = _normal(out, seed=8)
         return out, weight, pull(weight)[0]
 
-    _, weight, slopes = pulled(arguments)
+    return pulled, call, arguments, _normal(arguments)
+
+
+@each(CASES)
+def test_reverse_mode_is_the_difference_quotient(case):
+    backward, _, arguments, along = pulled(case)
+    _, weight, slopes = backward(arguments)
     _assert_finite(slopes)
     if case.choice.get("method") not in ROUGH:
-        product = _dot(weight, _quotient(pulled, arguments, along))
+        product = _dot(weight, _quotient(backward, arguments, along))
         _assert_close(_dot(slopes, along), product, tolerance=1e-4)
 
 
 @each(CASES)
 @pytest.mark.full
-def test_forward_mode_agrees_and_is_the_difference_quotient_everywhere(case):
-    call, arguments = case.split()
-    along = _normal(arguments)
-
-    @jax.jit  # One program for both modes, which takes less time to compile.
-    def derivatives(arguments):
-        out, pushed = jax.jvp(call, (arguments,), (along,))
-        reverse_out, pull = jax.vjp(call, arguments)
-        weight = _normal(out, seed=8)
-        products = _dot(weight, pushed), _dot(pull(weight)[0], along)
-        return out, pushed, reverse_out, products
-
-    out, pushed, reverse_out, products = derivatives(arguments)
+def test_forward_mode_is_reverse_mode_and_everywhere_the_difference_quotient(case):
+    backward, call, arguments, along = pulled(case)
+    forward = jax.jit(lambda arguments: jax.jvp(call, (arguments,), (along,)))
+    out, pushed = forward(arguments)
+    reverse_out, weight, slopes = backward(arguments)
     _assert_close(reverse_out, out)
-    _assert_close(*products, tolerance=1e-8)
+    _assert_close(_dot(weight, pushed), _dot(slopes, along), tolerance=1e-8)
     if case.choice.get("method") not in ROUGH:
-        _assert_close(pushed, _quotient(derivatives, arguments, along), tolerance=1e-5)
+        _assert_close(pushed, _quotient(forward, arguments, along), tolerance=1e-5)
 
 
 # What differs by a type of argument alone goes through the same code.

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxfx._progress import Bar
 
@@ -18,7 +18,13 @@ Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 
 # Our own solver has also converged when so many steps make the loss smaller by less than this
 # share: in float32, rounding hides from it that it has arrived.
-_PATIENCE, _GAIN = 6, 1e-5
+PATIENCE, GAIN = 6, 1e-5
+
+# Where Huber's loss turns from squares to sizes, in standard deviations of the noise.
+CORNER = 1.345
+
+# An image has this many tiles a side whose residuals are taken for independent.
+_TILES = 8
 
 
 _Item: Any = type(optx.RESULTS.successful)
@@ -61,14 +67,17 @@ def descend(
     solver: Solver | None,
     max_steps: int,
     bar: Bar,
+    patience: int = PATIENCE,
+    gain: float = GAIN,
 ) -> End:
     """From a start to the end that a solver finds, Levenberg-Marquardt if none is given.
 
     `residual` is an `equinox.Module`, from a pytree of numbers in JAX's default type to an
     array of that type: its class and shapes decide what is compiled anew. The loss is its mean
-    square.
+    square. Our own solver has also converged when `patience` steps make the loss smaller by
+    less than `gain`, a share of it.
     """
-    patience = _PATIENCE if solver is None else max_steps
+    patience = patience if solver is None else max_steps
     solver = _default_solver() if solver is None else solver
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     y, state = unknowns, _begin(solver, fn, unknowns)
@@ -79,7 +88,7 @@ def descend(
         y, state, loss, done, result = _step(solver, fn, y, state)
         losses.append(loss)
         bar.step(mse=f"{float(loss):.3g}")
-        waited = waited + 1 if loss > (1 - _GAIN) * lowest else 0
+        waited = waited + 1 if loss > (1 - gain) * lowest else 0
         if loss < lowest:
             lowest, best = float(loss), given
         if done or waited >= patience or result != optx.RESULTS.successful:
@@ -149,6 +158,61 @@ def _finish(solver, fn, y, arrays, loss, result):
 @eqx.filter_jit
 def _loss(fn, y):
     return fn(y, None)[1]
+
+
+def huber(residual: Float[Array, "..."], corner: float = CORNER) -> Float[Array, "..."]:
+    """Residuals whose squares are twice Huber's loss: they grow by the root beyond the corner.
+
+    Source: Huber 1964, "Robust estimation of a location parameter", eq. 1.3.
+    """
+    size = jnp.abs(residual)
+    beyond = size > corner
+    root = jnp.sqrt(corner * (2 * jnp.where(beyond, size, corner) - corner))
+    return jnp.where(beyond, jnp.sign(residual) * root, residual)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def covariance(
+    columns: Float[Array, "residual unknown"],
+    residual: Float[Array, " residual"],
+    block: Int[Array, " residual"],
+    count: int,
+) -> Float[Array, "unknown unknown"]:
+    """The covariance of what least squares find, by the jackknife over blocks of residuals.
+
+    Each block is left out in turn, and the solution moves by one Gauss-Newton step. Residuals
+    may depend on one another within a block; those of different blocks are taken for
+    independent. A direction in which nothing moves has the variance of rounding's size.
+
+    Source: Cameron & Miller 2015, "A practitioner's guide to cluster-robust inference", CV3.
+    """
+    norms = jnp.linalg.norm(columns, axis=0)
+    norms = jnp.where(norms > 0, norms, 1)
+    scaled, unknowns = columns / norms[None], columns.shape[1]
+    sums = lambda values: jax.ops.segment_sum(values, block, count)
+    curvature = jnp.stack([sums(scaled * scaled[:, [i]]) for i in range(unknowns)], axis=1)
+    slope = sums(scaled * residual[:, None])
+    eigenvalues, vectors = jnp.linalg.eigh(
+        jnp.sum(curvature, axis=0, keepdims=True) - curvature
+    )
+    eigenvalues = jnp.maximum(eigenvalues, jnp.finfo(columns.dtype).eps)
+    along = jnp.einsum("bji,bj->bi", vectors, jnp.sum(slope, axis=0, keepdims=True) - slope)
+    moves = jnp.einsum("bij,bj->bi", vectors, along / eigenvalues)
+    is_used = jnp.any(curvature != 0, axis=(1, 2))
+    used = jnp.sum(is_used)
+    used = jnp.maximum(used, 1).astype(columns.dtype)
+    moves = jnp.where(is_used[:, None], moves, 0)
+    middle = jnp.sum(moves, axis=0, keepdims=True) / used
+    moves = jnp.where(is_used[:, None], moves - middle, 0)
+    found = (1 - 1 / used) * moves.T @ moves / (norms[:, None] * norms[None])
+    return jnp.where(used > unknowns, found, jnp.inf)
+
+
+def tiles(shape: tuple[int, ...], side: int = _TILES) -> tuple[Int[Array, " residual"], int]:
+    """For each residual of an image, in `side` x `side` tiles, its tile; and their number."""
+    row, column = (jnp.arange(size) * side // size for size in shape[:2])
+    tile = side * row[:, None] + column[None]
+    return jnp.repeat(tile.reshape(-1), math.prod(shape[2:])), side * side
 
 
 def standard_errors(

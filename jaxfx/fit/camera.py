@@ -3,29 +3,55 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, Literal, final, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Num
+from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera
-from jaxfx._checks import Number, WholeNumber, check, check_image, whole_number
+from jaxfx._checks import (
+    Number,
+    WholeNumber,
+    check,
+    check_depth,
+    check_image,
+    option,
+    whole_number,
+)
 from jaxfx._numerics import safe_divide
 from jaxfx._progress import Bar
-from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
-from jaxfx.fit._descent import End, Solver, descend, standard_errors, verdict
-from jaxfx.reproject._view import look
+from jaxfx.fit._descent import End, Solver, covariance, descend, huber, tiles
+from jaxfx.fit._pose import (
+    Comparison,
+    Residual,
+    Views,
+    blurred,
+    clear_of_steps,
+    reduced,
+    report,
+    shrunk,
+    thinned,
+)
 from jaxfx.reproject.warp import check_options, check_source
 
 
 # The widest blur's sigma is at most this share of the picture's side; the last's is a pixel.
 _WIDEST = 1 / 16
+
+# The coarse steps are made on images of at most so many pixels a side, the last ones with so
+# many of the reference's pixels.
+_COARSE, _RAYS = 160, 160 * 120
+
+# What a pose must meet to be trusted: ratios, and a standard error in radians. Chosen on pairs
+# of rendered views of every overlap, in `tests/fit/test_overlap.py`.
+_LEAST_SHARE, _LEAST_EXPLAINED, _MOST_WANDER = 0.05, 0.7, 1.2e-2
+
+Exposure = Literal["free", "equal"]
 
 
 @final
@@ -33,26 +59,58 @@ class CameraFit(eqx.Module):
     """What `camera` found.
 
     - `camera`: the start's intrinsics with the fitted pose, a `PinholeCamera`.
+    - `gain`, `offset`: channel, what takes the source's radiance to the reference's, a ratio
+      and units of radiance.
     - `losses`: the mean squared residual at the start and after every step, in squared units of
       radiance; it jumps where the search goes on with less blur.
-    - `uncertainty`: 6, a standard error for each part of the twist about the fitted pose, in
-      its own axes: three of translation in scene units, three of rotation in radians. As if
-      the residuals were independent: they are not, so compare the numbers with one another.
+    - `covariance`: 6 x 6, of the twist about the fitted pose in its own axes: three of
+      translation in scene units, three of rotation in radians. It takes the residuals of 8 x 8
+      tiles of the reference for independent of one another, and no others.
     - `share`: the share of the reference's pixels, a ratio, that had a say in the end.
-    - `result`: optimistix' verdict on the sharpest pictures, and divergence where nothing of
-      the source is seen in the end.
+    - `explained`: the share of the reference's contrast there, a ratio, that is explained: 1
+      leaves no difference, 0 is no better than an even image.
+    - `reach`: the median depth of the source, in scene units.
+    - `result`: optimistix' verdict on the sharpest images.
     """
 
     camera: PinholeCamera
+    gain: Float[Array, " channel"]
+    offset: Float[Array, " channel"]
     losses: Float[Array, " steps"]
-    uncertainty: Float[Array, "6"]
+    covariance: Float[Array, "6 6"]
     share: Float[Array, ""]
+    explained: Float[Array, ""]
+    reach: Float[Array, ""]
     result: optx.RESULTS
 
     @property
+    def uncertainty(self) -> Float[Array, "6"]:
+        """The standard errors, 6: the roots of the covariance's diagonal, in its units."""
+        return jnp.sqrt(jnp.diagonal(self.covariance))
+
+    @property
+    def wander(self) -> Float[Array, ""]:
+        """By how far the images of points may be off: a standard error, in radians."""
+        shift, turn = jnp.split(jnp.diagonal(self.covariance), 2)
+        return jnp.sqrt(jnp.sum(shift) / self.reach**2 + jnp.sum(turn))
+
+    @property
+    def doubt(self) -> str:
+        """Why the pose is not to be trusted, as a sentence; empty where it is."""
+        if self.share < _LEAST_SHARE:
+            return f"Both see only {100 * float(self.share):.0f} % of the pixels."
+        if self.result != optx.RESULTS.successful:
+            return str(self.result)
+        if self.explained < _LEAST_EXPLAINED:
+            return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
+        if not self.wander < _MOST_WANDER:
+            return f"Its standard error is {float(self.wander):.2g} radians."
+        return ""
+
+    @property
     def success(self) -> bool:
-        """Whether the solver converged."""
-        return bool(self.result == optx.RESULTS.successful)
+        """Whether the solver converged, to a pose that the images tell."""
+        return not self.doubt
 
 
 def camera(
@@ -62,6 +120,8 @@ def camera(
     source: PinholeCamera,
     start: PinholeCamera,
     *,
+    reference_depth: Num[ArrayLike, "rows columns"] | None = None,
+    exposure: Exposure = "free",
     hole_threshold: Number = 0.1,
     solver: Solver | None = None,
     max_steps: WholeNumber = 32,
@@ -70,22 +130,27 @@ def camera(
 ) -> CameraFit:
     """The pose from which a photograph was taken, given another one with its depth.
 
-    Least squares between the photograph and the reprojection of the other, over a twist of six
-    numbers about the start, from coarse to fine: both pictures are blurred by a sigma of a
-    sixteenth of their side, then by half of that, and so on down to a pixel. The last blur
-    stays: a reprojected picture is read between pixels, hence smoother than a photograph, and
-    sharp ones would draw the pose to where both look equally smooth. The derivative is that of
-    the point where a pixel's ray meets the depth.
+    Differences between the photograph and the reprojection of the other are made small over a
+    twist of six numbers about the start, by Huber's loss: squares up to 1.3 standard deviations
+    of the noise, which the data tell, and sizes beyond. Gain and offset of each channel are
+    those that fit best. The search goes from coarse to fine: images of at most 160 pixels a
+    side are blurred by a sigma of a sixteenth of their side, then by half of that, and so on
+    down to a pixel; the last steps are made on the images as given, with some 19,000 pixels of
+    the photograph. The last blur stays: a reprojected image is read between pixels, hence
+    smoother than a photograph, and sharp ones would draw the pose to where both look equally
+    smooth. The derivative is that of the point where a pixel's ray meets the depth.
 
     Silhouettes are left out: pixels that look next to a step in depth or to where the source
     saw nothing, and the pixels beside those. What comes into sight there is a change of
     visibility, which the derivative does not contain: the pixel's colour jumps from one
     surface's to another's while its derivative follows only the one that it shows. Kept, such
-    pixels would pull the pose to where they happen to agree.
+    pixels would pull the pose to where they happen to agree. So is what lies at the frame of
+    either image, whose blur lacks what is outside.
 
-    It takes the scene to be lit and coloured alike in both pictures, highlights included, and
-    finds the nearest minimum: a start more than a few degrees away, or a texture that repeats
-    within that, may lead to a wrong one.
+    It takes the scene to be lit alike in both images, but for their exposure, and finds the
+    nearest minimum: a texture that repeats, or a start that is too far, may lead to a wrong
+    one. `success` says whether the images tell the pose: by the share of pixels that both see,
+    the contrast that is explained, and the standard error.
 
     **Arguments:**
 
@@ -94,11 +159,14 @@ def camera(
     - `depth`: height width, scene units along the axis of `source`; inf, and what is missing
       (0, negative, NaN), as in `reproject.warp`.
     - `source`: the camera of `image` and `depth`.
-    - `start`: the reference's camera with its true intrinsics and a pose to start from: some
-      3 degrees and 3 % of the scene's depth away. Of four pairs of photographs of a room with
-      their depth, 160 x 120 pixels, two that lie 1.5 and 3.8 degrees apart (5 and 9 cm) were
-      found from the source's own pose to 0.04 degrees and 2 mm; two that lie 7.7 degrees apart
-      (14 and 26 cm) to 0.06 degrees and 2 mm, and to 0.4 degrees and 13 mm.
+    - `start`: the reference's camera with its true intrinsics and a pose to start from. Of four
+      pairs of photographs of a room with their depth, 160 x 120 pixels, 1.5 to 7.7 degrees and
+      5 to 26 cm apart, all were found from the source's own pose: to 0.04 to 0.08 degrees and
+      2 to 4 mm, and with `reference_depth` to 0.02 degrees and 0.5 mm; alike where one image
+      was a quarter brighter or darker.
+    - `reference_depth`: rows columns, the photograph's own depth where it has one, in the units
+      of `depth`; its ratio to the depth that is seen counts beside the colors.
+    - `exposure`: `"free"`, or `"equal"` where both images have the same radiance.
     - `hole_threshold`: as in `reproject.warp`, a ratio of depths.
     - `solver`: any least-squares solver or minimiser of optimistix; by default
       Levenberg-Marquardt.
@@ -108,81 +176,132 @@ def camera(
 
     **Returns:** a `CameraFit`.
 
-    **Raises:** `ValueError` for wrong shapes, cameras or options, a picture that is not finite,
-    or a depth that is nowhere known. `RuntimeError` where the solver fails or ends where
-    nothing of the source is seen, and `throw` is true.
+    **Raises:** `ValueError` for wrong shapes, cameras or options, an image that is not finite,
+    or a depth that is nowhere known. `RuntimeError` where the fit is no success and `throw` is
+    true.
 
     **Gradient:** none through the search: it stops at every step to report.
 
     Source: Lucas & Kanade 1981, image registration, from coarse to fine; Murray, Li & Sastry
-    1994, the exponential of a twist; the masks and the last blur are our own.
+    1994, the exponential of a twist; Huber 1964, the loss; Golub & Pereyra 1973, exposure by
+    variable projection; the masks, the last blur and the bounds of success are our own.
     """
-    reference, image, depth = _pictures(reference, image, depth)
-    max_steps = _check(source, start, max_steps)
-    check_options("camera", reference.shape[:2], "pyramid", hole_threshold)
+    views = _views(reference, reference_depth, image, depth, source, start)
+    max_steps = whole_number("camera(max_steps=...)", max_steps)
+    check_options("camera", views.reference.shape[:2], "pyramid", hole_threshold)
+    option("camera(exposure=...)", exposure, get_args(Exposure))
     with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
-        model, end = _search(
-            reference, image, depth, source, start, float(hole_threshold), descend_on
-        )
-    columns, residual, share = _report(model, end.unknowns)
-    # Where nothing is seen the residual is 0, which a solver takes for success.
-    result = end.result if share > 0 else verdict(optx.RESULTS.nonlinear_divergence)
-    if throw and result != optx.RESULTS.successful:
+        model, end = _search(views, float(hole_threshold), exposure == "free", descend_on)
+    fitted = _fitted(model, end)
+    if throw and not fitted.success:
         raise RuntimeError(
             f"`camera` found no pose in {len(end.losses)} steps, the mean squared residual "
-            f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g} over "
-            f"{100 * float(share):.0f} % of the pixels: {result} "
+            f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {fitted.doubt} "
             "`throw=False` returns what was reached."
         )
-    errors = standard_errors(columns, residual) / jnp.sqrt(share)
-    errors = jnp.where(share > 0, errors, jnp.inf) * model.unit
-    eye, losses = model.eye(end.unknowns), jnp.stack(end.losses)
-    return CameraFit(eye, losses, errors, share, result)
+    return fitted
+
+
+def _fitted(model: Residual, end: End) -> CameraFit:
+    """What was found, and how sure it is."""
+    columns, residual, found = report(model, end.unknowns)
+    block, count = tiles(residual.shape)
+    spread = covariance(columns, residual.reshape(-1), block, count)
+    spread = spread * model.unit[:, None] * model.unit[None]
+    share = jnp.mean(found.counts)
+    color = found.noise[..., : found.gain.size]
+    rest = jnp.mean((model.scale[0] * huber(color)) ** 2 * found.counts[..., None])
+    contrast = share * found.contrast.astype(float)
+    return CameraFit(
+        model.eye(end.unknowns),
+        found.gain,
+        found.offset,
+        jnp.stack(end.losses),
+        jnp.where(share > 0, spread, jnp.inf),
+        share,
+        jnp.where(contrast > 0, 1 - safe_divide(rest, contrast), 0),
+        model.unit[0],
+        end.result,
+    )
 
 
 def _search(
-    reference: Array,
-    image: Array,
-    depth: Array,
-    source: PinholeCamera,
-    start: PinholeCamera,
-    threshold: int | float,
-    descend_on: Callable[["_Residual", Array], End],
-) -> tuple["_Residual", End]:
-    """From one blur to the next, and the model of the last."""
-    known = jnp.isfinite(depth) & (depth > 0)
-    reach = jnp.nanmedian(jnp.where(known, depth, jnp.nan)).astype(float)
+    views: Views, threshold: float, exposure: bool, descend_on: Callable[..., End]
+) -> tuple[Residual, End]:
+    """From one blur to the next on reduced images, then on the given ones; the last model."""
+    known = jnp.isfinite(views.depth) & (views.depth > 0)
+    reach = jnp.nanmedian(jnp.where(known, views.depth, jnp.nan)).astype(float)
     unit = jnp.concatenate([jnp.full(3, reach), jnp.ones(3, float)])
-    clear = _clear_of_steps(depth, threshold)
-    # One blur for both, in the world: a pixel of the coarser picture at the least.
-    finer = float(source.intrinsics[0, 0] / start.intrinsics[0, 0])
 
-    def model(sigma: float) -> _Residual:
-        pictures = (
-            _blurred(reference, jnp.asarray(sigma * max(1 / finer, 1))),
-            _blurred(image, jnp.asarray(sigma * max(finer, 1))),
+    def model(views: Views, sigma: float, twist: Array, stride: int = 1) -> Residual:
+        """With images blurred alike in the world, and the scale of noise at the twist."""
+        finer = float(views.source.intrinsics[0, 0] / views.start.intrinsics[0, 0])
+        soft = views._replace(
+            reference=blurred(views.reference, jnp.asarray(sigma * max(1 / finer, 1))),
+            image=blurred(views.image, jnp.asarray(sigma * max(finer, 1))),
         )
-        return _Residual(*pictures, depth, clear, source, start, unit, threshold)
+        clear = clear_of_steps(views.depth, threshold)
+        first = Residual(soft, clear, unit, jnp.ones(2, float), threshold, exposure, stride)
+        return eqx.tree_at(lambda m: m.scale, first, _scale(report(first, twist)[2]))
 
-    *coarse, sharpest = map(model, _sigmas(min(reference.shape[:2])))
+    small = _small(views)
     twist, losses = jnp.zeros(6, float), []
-    for blurred in coarse:
-        end = descend_on(blurred, twist)
+    sharpest, *coarse = reversed(_sigmas(min(small.reference.shape[:2])))
+    for sigma in reversed(coarse):
+        end = descend_on(model(small, sigma, twist), twist, patience=2, gain=1e-2)
         twist, losses = end.unknowns, losses + end.losses
-    end = descend_on(sharpest, twist)
-    return sharpest, end._replace(losses=losses + end.losses)
+    last = model(small, sharpest, twist)
+    if small is not views:
+        end = descend_on(last, twist, patience=2, gain=1e-2)
+        twist, losses = end.unknowns, losses + end.losses
+        pixels = math.prod(views.reference.shape[:2])
+        last = model(views, sharpest, twist, math.ceil(math.sqrt(pixels / _RAYS)))
+    end = descend_on(last, twist, gain=1e-4)
+    return last, end._replace(losses=losses + end.losses)
 
 
-def _check(source: Any, start: Any, max_steps: Any) -> int:
-    """The number of steps; `ValueError` names a camera or a number that is none."""
+def _small(views: Views) -> Views:
+    """The views with images of at most `_COARSE` pixels a side, and the cameras of those."""
+    of_reference, of_source = (
+        math.ceil(max(size) / _COARSE)
+        for size in (views.reference.shape[:2], views.depth.shape)
+    )
+    if of_reference == of_source == 1:
+        return views
+    own = views.reference_depth
+    return Views(
+        reduced(views.reference, of_reference),
+        None if own is None else thinned(own, of_reference),
+        reduced(views.image, of_source),
+        thinned(views.depth, of_source),
+        shrunk(views.source, of_source),
+        shrunk(views.start, of_reference),
+    )
+
+
+def _scale(found: Comparison) -> Float[Array, "2"]:
+    """The standard deviation of noise in what is compared: color, and depth where there is one.
+
+    From the median of the absolute differences, which outliers do not move.
+    """
+    channels = found.gain.size
+    sizes = jnp.where(found.counts[..., None] > 0, jnp.abs(found.noise), jnp.nan)
+    color, own = sizes[..., :channels], sizes[..., channels:]
+    least = 1e-3 * jnp.sqrt(found.contrast.astype(float)) + 1e-9
+    color = jnp.maximum(jnp.nan_to_num(1.4826 * jnp.nanmedian(color)), least)
+    if own.size == 0:
+        return jnp.stack([color, jnp.ones_like(color)])
+    own = 1.4826 * jnp.nanmedian(jnp.where(own > 0, own, jnp.nan))
+    return jnp.stack([color, jnp.maximum(jnp.nan_to_num(own, nan=1.0), 1e-4)])
+
+
+def _views(
+    reference: Any, reference_depth: Any, image: Any, depth: Any, source: Any, start: Any
+) -> Views:
+    """What was given, checked, in the type of `image`."""
     for name, eye in (("source", source), ("start", start)):
         check_camera(f"camera({name})", eye, PinholeCamera)
-    return whole_number("camera(max_steps=...)", max_steps)
-
-
-def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Array]:
-    """The pictures, checked, in the type of `image`."""
     image = check_image("camera(image)", image)
     reference = check_image("camera(reference)", reference)
     depth = check_source("camera", depth, image.shape[:2])
@@ -193,97 +312,18 @@ def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Arr
         )
     for name, value in (("image", image), ("reference", reference)):
         check(f"camera({name})", value, np.isfinite, "finite")
-    check("camera(depth)", depth, lambda v: (np.isfinite(v) & (v > 0)).any(), "known somewhere")
-    return reference.astype(image.dtype), image, depth.astype(image.dtype)
+    known = lambda v: (np.isfinite(v) & (v > 0)).any()
+    check("camera(depth)", depth, known, "known somewhere")
+    if reference_depth is not None:
+        name = "camera(reference_depth=...)"
+        reference_depth = check_depth(name, reference_depth, reference.shape[:2])
+        check(name, reference_depth, known, "known somewhere")
+        reference_depth = reference_depth.astype(image.dtype)
+    reference, depth = reference.astype(image.dtype), depth.astype(image.dtype)
+    return Views(reference, reference_depth, image, depth, source, start)
 
 
 def _sigmas(side: int) -> list[float]:
     """Of the blurs, in pixels, from coarse to fine."""
     halvings = int(math.log2(max(1, _WIDEST * side)))
     return [2.0**level for level in range(halvings, -1, -1)]
-
-
-@jax.jit
-def _blurred(image: Array, sigma: Array) -> Float[Array, "height width channel"]:
-    """A Gaussian of what is inside the frame: one program for all sigmas."""
-
-    def weights(size: int) -> Float[Array, "size size"]:
-        place = jnp.arange(size, dtype=image.dtype) / sigma.astype(image.dtype)
-        weight = jnp.exp(-0.5 * (place[:, None] - place[None]) ** 2)
-        return weight / jnp.sum(weight, axis=1, keepdims=True)
-
-    down, across = map(weights, image.shape[:2])
-    return jnp.einsum("ij,jkc,lk->ilc", down, image, across)
-
-
-def _largest(x: Array) -> Array:
-    """The largest of 3 x 3."""
-    return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (3, 3), (1, 1), "SAME")
-
-
-@eqx.filter_jit
-def _clear_of_steps(depth: Array, threshold: int | float) -> Bool[Array, "height width"]:
-    """Where no step in depth is within two texels."""
-    known = (depth > 0) & jnp.isfinite(depth)
-    inverse = safe_divide(known.astype(depth.dtype), jnp.where(known, depth, 1))
-    step = _largest(inverse) > (1 + threshold) * -_largest(-inverse)
-    return _largest(step.astype(depth.dtype)) == 0
-
-
-class _Residual(eqx.Module):
-    """The reprojected picture less the reference, where both are known, from a pose."""
-
-    reference: Float[Array, "rows columns channel"]
-    image: Float[Array, "height width channel"]
-    depth: Float[Array, "height width"]
-    clear: Bool[Array, "height width"]
-    source: PinholeCamera
-    start: PinholeCamera
-    unit: Float[Array, "6"]
-    hole_threshold: int | float = eqx.field(static=True)
-
-    def eye(self, twist: Float[Array, "6"]) -> PinholeCamera:
-        """The start moved by a twist, in its own axes."""
-        pose = self.start.world_from_camera
-        moved = pose.astype(float) @ _rigid(twist * self.unit)
-        return PinholeCamera(self.start.intrinsics, moved.astype(pose.dtype))
-
-    def difference(self, twist: Float[Array, "6"]) -> tuple[Array, Float[Array, ""]]:
-        """The residual, and the share of pixels that have a say in it."""
-        rows, columns, _ = self.reference.shape
-        pixels = pixel_centers(rows, columns, self.depth.dtype).reshape(-1, 2)
-        options = {"method": "pyramid", "hole_threshold": self.hole_threshold}
-        view = look(self.depth, self.source, self.eye(twist), pixels, **options)
-        shown = bilinear(self.image, view.pixels).reshape(self.reference.shape)
-        counts = view.mask & nearest(self.clear, view.pixels)
-        ignored = (~counts).astype(shown.dtype).reshape(rows, columns)
-        counts = 1 - _largest(jax.lax.stop_gradient(ignored))
-        # By the root of their share: to look away from what differs shall not pay.
-        share = jnp.mean(counts)
-        weight = counts / jnp.sqrt(jnp.maximum(share, 1 / counts.size))
-        residual = (shown - self.reference) * jnp.broadcast_to(weight[..., None], shown.shape)
-        return residual.astype(float), share
-
-    def __call__(self, twist: Float[Array, "6"]) -> Float[Array, "rows columns channel"]:
-        return self.difference(twist)[0]
-
-
-@eqx.filter_jit
-def _report(model: _Residual, twist: Array) -> tuple[Array, Array, Array]:
-    """The columns of the Jacobian, the residual, and the share of pixels in it."""
-
-    def difference(twist: Array) -> tuple[Array, tuple[Array, Array]]:
-        residual, share = model.difference(twist)
-        return residual, (residual, share)
-
-    columns, (residual, share) = jax.jacfwd(difference, has_aux=True)(twist)
-    return columns.reshape(-1, 6), residual, share.astype(float)
-
-
-def _rigid(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    """The rigid motion of a twist: three of translation, three of rotation, in radians."""
-    generator = jnp.zeros((4, 4), twist.dtype).at[:3, 3].set(twist[:3])
-    x, y, z = twist[3:]
-    zero = jnp.zeros_like(x)
-    turn = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return jax.scipy.linalg.expm(generator.at[:3, :3].set(turn))
