@@ -187,25 +187,31 @@ def covariance(
     Source: Cameron & Miller 2015, "A practitioner's guide to cluster-robust inference", CV3.
     """
     norms = jnp.linalg.norm(columns, axis=0)
-    norms = jnp.where(norms > 0, norms, 1)
-    scaled, unknowns = columns / norms[None], columns.shape[1]
+    is_told, unknowns = norms > 0, columns.shape[1]
+    norms = jnp.where(is_told, norms, 1)
+    scaled = columns / norms[None]
     sums = lambda values: jax.ops.segment_sum(values, block, count)
     curvature = jnp.stack([sums(scaled * scaled[:, [i]]) for i in range(unknowns)], axis=1)
     slope = sums(scaled * residual[:, None])
-    eigenvalues, vectors = jnp.linalg.eigh(
-        jnp.sum(curvature, axis=0, keepdims=True) - curvature
-    )
-    eigenvalues = jnp.maximum(eigenvalues, jnp.finfo(columns.dtype).eps)
+    floor = jnp.finfo(columns.dtype).eps
+    rest = jnp.sum(curvature, axis=0, keepdims=True) - curvature
+    eigenvalues, vectors = jnp.linalg.eigh(rest)
     along = jnp.einsum("bji,bj->bi", vectors, jnp.sum(slope, axis=0, keepdims=True) - slope)
-    moves = jnp.einsum("bij,bj->bi", vectors, along / eigenvalues)
+    moves = jnp.einsum("bij,bj->bi", vectors, along / jnp.maximum(eigenvalues, floor))
     is_used = jnp.any(curvature != 0, axis=(1, 2))
     used = jnp.sum(is_used)
+    is_enough = used > unknowns
     used = jnp.maximum(used, 1).astype(columns.dtype)
     moves = jnp.where(is_used[:, None], moves, 0)
     middle = jnp.sum(moves, axis=0, keepdims=True) / used
     moves = jnp.where(is_used[:, None], moves - middle, 0)
-    found = (1 - 1 / used) * moves.T @ moves / (norms[:, None] * norms[None])
-    return jnp.where(used > unknowns, found, jnp.inf)
+    found = (1 - 1 / used) * moves.T @ moves
+    # Where leaving out a block changes nothing, since nothing moves at all.
+    eigenvalues, vectors = jnp.linalg.eigh(jnp.sum(curvature, axis=0))
+    flat = jnp.where(eigenvalues < 64 * floor, jnp.mean(residual**2) / floor, 0)
+    found = (found + (vectors * flat[None]) @ vectors.T) / (norms[:, None] * norms[None])
+    is_known = is_enough & is_told
+    return jnp.where(is_known[:, None] & is_known[None], found, jnp.inf)
 
 
 def tiles(shape: tuple[int, ...], side: int = _TILES) -> tuple[Int[Array, " residual"], int]:
