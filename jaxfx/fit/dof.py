@@ -31,7 +31,7 @@ from jaxfx.dof._inputs import largest_coc
 from jaxfx.dof._sprites import POINT_RADIUS
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
-from jaxfx.fit._descent import End, Solver, descend, standard_errors
+from jaxfx.fit._descent import End, Solver, covariance, descend, tiles
 from jaxfx.lens import ThinLens
 
 
@@ -58,10 +58,10 @@ class DofFit(eqx.Module):
     - `image`: height width channel, the picture with them.
     - `losses`: the mean squared residual at the start and after every step, in squared units
       of radiance; it may rise where the search starts again.
-    - `uncertainty`: a standard error for each fitted parameter, in its own unit, as if the
-      residuals were independent: they seldom are, so compare the numbers with one another. A
-      parameter that the picture can't tell has a large one, or inf. It knows nothing of other
-      minima.
+    - `uncertainty`: a standard error for each fitted parameter, in its own unit. It takes the
+      residuals of 8 x 8 tiles of the image for independent of one another, and no others. A
+      parameter that the image does not tell has a large one, or inf. It knows nothing of other
+      minima, nor of what the method itself gets wrong, as at the edges of near surfaces.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
       larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
     - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
@@ -96,6 +96,7 @@ def dof(
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
     max_coc: Number | None = None,
+    weights: Num[ArrayLike, "height width"] | None = None,
     solver: Solver | None = None,
     parameters: Collection[str] | None = None,
     max_steps: WholeNumber = 64,
@@ -120,6 +121,9 @@ def dof(
       `dof.layered`; of `"layered"`.
     - `max_coc`: static; the largest diameter, in pixels, that the search may draw. By default
       half as large again as the start's largest, and larger wherever that proves too small.
+    - `weights`: height width, no unit: how much the square of each pixel's difference counts;
+      0 leaves a pixel out. Pixels beside steps in depth show surfaces that the image lacks, and
+      highlights have squares that decide alone: both are worth leaving out.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.PARAMETERS` or, of `"layered"`, out of
@@ -145,18 +149,27 @@ def dof(
     if max_coc is not None:
         max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
     _check_moves(unknowns, lens, depth, behind, max_coc)
+    root = _root_of_weights(weights, image)
     model = _Model(image, depth, behind, lens.focal_pixels, start, method, max_coc)
     with Bar(progress, "fit") as bar:
         solve = lambda model, y: descend(
-            _Residual(model, reference), y, solver=solver, max_steps=max_steps, bar=bar
+            _Residual(model, reference, root), y, solver=solver, max_steps=max_steps, bar=bar
         )
         model, end = _search(model, unknowns, solve)
     if throw:
         end.check("dof", "lens")
-    found = _constrain(end.unknowns, image.dtype)
-    values = start | found
+    return _fitted(model, end, reference, root)
+
+
+def _fitted(model: "_Model", end: End, reference: Array, root: Array) -> DofFit:
+    """What was found, and how sure it is."""
+    found = _constrain(end.unknowns, reference.dtype)
+    values = model.start | found
     fitted = _drawn(model, found)
-    errors = standard_errors(_columns(model, found), fitted - reference)
+    residual = root * (fitted - reference)
+    columns = root.repeat(reference.shape[2], axis=2).reshape(-1, 1) * _columns(model, found)
+    block, count = tiles(residual.shape)
+    errors = jnp.sqrt(jnp.diagonal(covariance(columns, residual.reshape(-1), block, count)))
     return DofFit(
         model.lens(found),
         values["gamma"],
@@ -184,6 +197,16 @@ def _pictures(reference: Any, image: Any, depth: Any) -> tuple[Array, Array, Arr
         check(f"dof({name})", value, np.isfinite, "finite")
     check("dof(depth)", depth, lambda v: (v > 0).any(), "known somewhere")
     return reference.astype(image.dtype), image, depth
+
+
+def _root_of_weights(weights: Any, image: Array) -> Float[Array, "height width 1"]:
+    """The factor of each pixel's difference, in the type of `image`."""
+    if weights is None:
+        return jnp.ones((*image.shape[:2], 1), image.dtype)
+    weights = check_depth("dof(weights=...)", weights, image.shape[:2])
+    is_weight = lambda v: (np.isfinite(v) & (v >= 0)).all() and (v > 0).any()
+    check("dof(weights=...)", weights, is_weight, "finite, 0 or positive, and not all 0")
+    return jnp.sqrt(weights).astype(image.dtype)[..., None]
 
 
 def _start(lens: Any, gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike) -> _Unknowns:
@@ -314,10 +337,11 @@ class _Residual(eqx.Module):
 
     model: _Model
     reference: Float[Array, "height width channel"]
+    root: Float[Array, "height width 1"]
 
     def __call__(self, unknowns: _Unknowns) -> Float[Array, "height width channel"]:
         values = _constrain(unknowns, self.reference.dtype)
-        return (self.model(values) - self.reference).astype(float)
+        return (self.root * (self.model(values) - self.reference)).astype(float)
 
 
 @eqx.filter_jit

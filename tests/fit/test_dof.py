@@ -239,6 +239,24 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
     assert ((spread > 0.5) & (spread < 2)).all(), spread
 
 
+@pytest.mark.full
+def test_what_has_no_weight_has_no_say():
+    """A quarter of the reference is of another lens; with weights it does not matter."""
+    reference, image, depth = picture()
+    spoiled, weights = np.array(reference), np.ones((SIZE, SIZE))
+    spoiled[: SIZE // 2, : SIZE // 2], weights[: SIZE // 2, : SIZE // 2] = 0.9, 0
+    start = wrong((0, 1, 1, 0))
+    left_out = quietly(spoiled, image, depth, start, weights=weights)
+    assert found(left_out) == pytest.approx(TRUTH, rel=0.01)
+    told = quietly(spoiled, image, depth, start, throw=False)
+    assert found(told) != pytest.approx(TRUTH, rel=0.05)
+    # Twice the weights are twice the loss and the same fit.
+    heavy = quietly(reference, image, depth, start, weights=np.full((SIZE, SIZE), 2.0))
+    plain = quietly(reference, image, depth, start)
+    assert float(heavy.losses[0]) == pytest.approx(2 * float(plain.losses[0]))
+    assert found(heavy) == pytest.approx(found(plain), rel=1e-4)
+
+
 FAULTS = {
     "dof(image)": {"image": np.zeros((4, 4), np.float64)},
     "dof(image) must hold floats": {"image": np.zeros((SIZE, SIZE, 3), np.uint8)},
@@ -252,6 +270,8 @@ FAULTS = {
     "dof(lens) must start": {"lens": ThinLens(5.0, 0.1, 120.0), "max_coc": 2.0},
     "dof(gamma=...)": {"gamma": -1.0},
     "dof(epsilon=...)": {"epsilon": np.zeros(2)},
+    "dof(weights=...)": {"weights": np.ones((SIZE, SIZE + 1))},
+    "dof(weights=...) must be finite": {"weights": np.zeros((SIZE, SIZE))},
     "dof(parameters=...)": {"parameters": ("aperture", "focal_pixels")},
     "dof(parameters=...) must name some": {"parameters": ()},
     "dof(parameters=...) must name some of ('aperture', 'focus_distance', 'threshold')": {
