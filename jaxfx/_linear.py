@@ -37,8 +37,8 @@ def linear(
     # It is transposed in the whole of both pairs: what has no tangent, or no cotangent, borrows
     # a zero from what has.
     b = _with_zero_from(x, (x, zeros))
-    u, v = jax.lax.custom_linear_solve(matvec, b, solve, solve_transposed)
-    return _with_zero_from(u, v)
+    solved: Any = jax.lax.custom_linear_solve(matvec, b, solve, solve_transposed)
+    return _with_zero_from(*solved)
 
 
 def _with_zero_from(source: Any, tree: Any) -> Any:

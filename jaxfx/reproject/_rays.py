@@ -82,11 +82,13 @@ def _lines(
         scale, centre = target.pixels_per_unit.astype(dtype), target.centre.astype(dtype)
         plane = (x - centre[0]) / scale / unit, (y - centre[1]) / scale / unit
         x, y = zero, zero
-    far = [row[0] * x + row[1] * y + row[2] + its for row, its in zip(apart, own, strict=True)]
-    near = [
+    far_x, far_y, far_z = (
+        row[0] * x + row[1] * y + row[2] + its for row, its in zip(apart, own, strict=True)
+    )
+    near_x, near_y, near_z = (
         row[0] * plane[0] + row[1] * plane[1] + e for row, e in zip(apart, eye, strict=True)
-    ]
-    return tuple(far), tuple(near)
+    )
+    return (far_x, far_y, far_z), (near_x, near_y, near_z)
 
 
 def _clip(far: _Point, eye: _Point, shape: tuple[int, int]) -> tuple[Array, Array]:
