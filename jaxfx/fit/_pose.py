@@ -45,7 +45,8 @@ class Residual(eqx.Module):
     - `unit`: the unit of each part of a twist: scene units, then radians.
     - `scale`: the standard deviation of noise, in units of radiance and of relative depth.
     - `exposure`: whether gain and offset are free.
-    - `stride`: of the reference's rows and columns one in so many has a say.
+    - `stride`: the distance between the rows and columns of the reference that are compared, in
+      pixels.
     """
 
     views: Views
@@ -63,12 +64,12 @@ class Residual(eqx.Module):
         return PinholeCamera(start.intrinsics, moved.astype(start.world_from_camera.dtype))
 
     def _thinned(self, image: Array) -> Array:
-        """The pixels that have a say, from the middle of each square of `stride`."""
+        """The middle pixel of each square of `stride` pixels."""
         first = self.stride // 2
         return image[first :: self.stride, first :: self.stride]
 
     def compare(self, twist: Float[Array, "6"]) -> "Comparison":
-        """What differs between the reference and what the source shows of it, per pixel."""
+        """The difference per pixel between the reprojected source and the reference."""
         views, eye = self.views, self.eye(twist)
         rows, columns, _ = views.reference.shape
         pixels = self._thinned(pixel_centers(rows, columns, views.depth.dtype))
@@ -106,9 +107,12 @@ class Residual(eqx.Module):
 
 
 class Comparison(NamedTuple):
-    """What differs: in units of noise, at the pixels that count (1, else 0), after exposure.
+    """The reprojected source less the reference, per pixel, after gain and offset.
 
-    `contrast` is the mean square of the reference about its mean, in squared units of radiance.
+    - `noise`: the difference, in standard deviations of the noise.
+    - `counts`: 1 where a pixel is compared, 0 elsewhere.
+    - `gain`, `offset`: a ratio and units of radiance.
+    - `contrast`: the mean square of the reference about its mean, in squared units of radiance.
     """
 
     noise: Float[Array, "rows columns channel"]

@@ -43,12 +43,12 @@ from jaxfx.reproject.warp import check_options, check_source
 # The widest blur's sigma is at most this share of the picture's side; the last's is a pixel.
 _WIDEST = 1 / 16
 
-# The coarse steps are made on images of at most so many pixels a side, the last ones with so
-# many of the reference's pixels.
+# The largest side of the images of the coarse steps, in pixels, and the number of the
+# reference's pixels in the last steps.
 _COARSE, _RAYS = 160, 160 * 120
 
 # What a pose must meet to be trusted: ratios, and a standard error in radians. Chosen on pairs
-# of rendered views of every overlap, in `tests/fit/test_overlap.py`.
+# of rendered views of every overlap, in `tests/fit/test_camera.py`.
 _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_WANDER = 0.05, 0.7, 1.2e-2
 
 Exposure = Literal["free", "equal"]
@@ -204,7 +204,7 @@ def camera(
 
 
 def _fitted(model: Residual, end: End) -> CameraFit:
-    """What was found, and how sure it is."""
+    """The result at the end of a search: pose, exposure, covariance and quality."""
     columns, residual, found = report(model, end.unknowns)
     block, count = tiles(residual.shape)
     spread = covariance(columns, residual.reshape(-1), block, count)
@@ -299,7 +299,7 @@ def _scale(found: Comparison) -> Float[Array, "2"]:
 def _views(
     reference: Any, reference_depth: Any, image: Any, depth: Any, source: Any, start: Any
 ) -> Views:
-    """What was given, checked, in the type of `image`."""
+    """The checked arguments, in the type of `image`."""
     for name, eye in (("source", source), ("start", start)):
         check_camera(f"camera({name})", eye, PinholeCamera)
     image = check_image("camera(image)", image)

@@ -162,7 +162,7 @@ def dof(
 
 
 def _fitted(model: "_Model", end: End, reference: Array, root: Array) -> DofFit:
-    """What was found, and how sure it is."""
+    """The result at the end of a search: parameters, image and standard errors."""
     found = _constrain(end.unknowns, reference.dtype)
     values = model.start | found
     fitted = _drawn(model, found)

@@ -4,11 +4,13 @@ import functools
 import inspect
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, fit, relight, scene
+from jaxfx.fit import _pose
 from tests.cases import rooms
 from tests.helpers.forms import first
 
@@ -192,6 +194,37 @@ def test_success_is_what_the_images_tell_and_errors_are_of_the_size_that_is_stat
     assert missed <= 0.02 * count and false_alarms <= 0.05 * count
     assert 0.4 * count < len(within) < 0.9 * count
     assert np.mean(within, axis=0).min() >= 0.85
+
+
+@pytest.mark.full
+def test_the_residual_has_the_derivative_of_its_difference_quotient():
+    """Images, exposure and both depths, in a room without edges in sight; both modes."""
+    size, place = (24, 32), rooms.room(2, boxes=0)
+    first = rooms.pose(0.2, 0, np.zeros(3))
+    image, depth, source = rooms.seen(place, first, size, fov=0.7)
+    second = first @ rooms.pose(0.02, 0.01, np.array([0.03, 0.01, 0.02]))
+    reference, own, target = rooms.seen(place, second, size, fov=0.7)
+    arrays = [jnp.asarray(x, float) for x in (1.2 * reference, own, image, depth)]
+    views = _pose.Views(*arrays, source, target)
+    clear = _pose.clear_of_steps(views.depth, 0.1)
+    # With this scale no difference is beyond the corner of Huber's loss.
+    model = _pose.Residual(
+        views, clear, jnp.ones(6), jnp.ones(2), hole_threshold=0.1, exposure=True, stride=1
+    )
+    twist = jnp.asarray(np.random.default_rng(0).normal(size=6) * 1e-3)
+    columns, residual, found = _pose.report(model, twist)
+    assert float(found.counts.mean()) > 0.3
+    step = 1e-6
+    for i, along in enumerate(np.eye(6)):
+        ends = [_pose.report(model, twist + sign * step * along)[1] for sign in (1, -1)]
+        quotient = np.asarray(ends[0] - ends[1]).reshape(-1) / (2 * step)
+        differs = np.abs(quotient - columns[:, i]) > 1e-4 * np.abs(columns[:, i]).max()
+        # A ray that goes from one texel to the next changes the surface that it reads.
+        assert differs.mean() < 0.01
+    assert residual.shape == (*size, 4)
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=residual.shape))
+    pulled = jax.jit(lambda twist: jax.vjp(model, twist)[1](weight)[0])(twist)
+    np.testing.assert_allclose(pulled, weight.reshape(-1) @ columns, rtol=1e-7)
 
 
 @pytest.mark.full
