@@ -71,10 +71,12 @@ def cheapest_sources(
     """
     height, width = depth.shape
     shown = jnp.sqrt(jnp.clip(jnp.nan_to_num(guide), 0, 1))
-    planes = shown, depth, expected
+    unit = max(height, width)
     # A quarter turn for each of the four directions from which a step can come.
-    turned = [[jnp.rot90(plane, turn) for plane in planes] for turn in range(4)]
-    steps = [_steps_down(*three, max(height, width)) for three in turned]
+    steps = [
+        _steps_down(*(jnp.rot90(plane, turn) for plane in (shown, depth, expected)), unit=unit)
+        for turn in range(4)
+    ]
     known = jnp.where(jnp.isnan(depth), jnp.int32(BEYOND), jnp.int32(0))
     source = jnp.arange(height * width).reshape(height, width)
 
@@ -91,7 +93,7 @@ def cheapest_sources(
 
 
 def _steps_down(
-    guide: Float[Array, "height width channel"], depth: Plane, expected: Plane, unit: int
+    guide: Float[Array, "height width channel"], depth: Plane, expected: Plane, *, unit: int
 ) -> Cost:
     """What the step to each pixel from the one above it costs; beyond all in the first row."""
     edge = jnp.mean(jnp.abs(guide[1:] - guide[:-1]), axis=2)
