@@ -36,7 +36,8 @@ def read_rgbd(
     - `path`: the file.
     - `layer`: the name in front of the passes, `"ViewLayer"` say, of a view too
       (`"ViewLayer.left"`). Without it the passes with no name in front, which are those of the
-      first view, or the only layer that has both.
+      first view, or the only layer that has both; where none has, the only image and the
+      only depth.
     - `max_pixels`, `verify`: as for `read`.
 
     **Returns:** the image, height width channel, with the channels that the file has (1, 3 or
@@ -52,7 +53,7 @@ def read_rgbd(
     parts = read_parts(path, max_pixels, verify)
     channels = full_names(path, parts)
     layers = assemble(path, planes_of(channels))
-    images, _ = images_of(layers)
+    images, named = images_of(layers)
     depth_keys = depths_of(layers)
     # What bears no name is of the first view, whose name some of its passes may bear.
     if view := parts[0].header.get(
@@ -61,8 +62,16 @@ def read_rgbd(
         for found in (images, depth_keys):
             if key := [found[name] for name in ("", view) if name in found]:
                 found[""] = found[view] = key[0]
-    chosen = choose(path, "an image and a depth", images.keys() & depth_keys.keys(), layer)
-    keys = images[chosen], depth_keys[chosen]
+    both = images.keys() & depth_keys.keys()
+    if layer is None and not both and images and depth_keys:
+        # Each is looked for by itself: an image without a name before a layer's depth, say.
+        keys = (
+            images[choose_image(path, images, named, None)],
+            depth_keys[choose(path, "a depth", depth_keys, None)],
+        )
+    else:
+        chosen = choose(path, "an image and a depth", both, layer, [*layers])
+        keys = images[chosen], depth_keys[chosen]
     windows = [_windows(channels, key) for key in keys]
     if len(windows[0] | windows[1]) != 1:
         raise ValueError(
@@ -119,7 +128,21 @@ def _by_layer(keys: Iterable[str], words: tuple[str, ...]) -> dict[str, str]:
     return found
 
 
-def choose(path: StrPath, what: str, names: Iterable[str], layer: str | None) -> str:
+def choose_image(
+    path: StrPath, images: Mapping[str, str], named: list[str], layer: str | None
+) -> str:
+    """`layer`; without one the nameless image, or the only one that a pass calls so."""
+    fewest = named if layer is None and "" not in images and named else images
+    return choose(path, "an image", fewest, layer)
+
+
+def choose(
+    path: StrPath,
+    what: str,
+    names: Iterable[str],
+    layer: str | None,
+    others: Iterable[str] = (),
+) -> str:
     """`layer` if it is one of `names`; without one, the nameless one, or the only one."""
     names = sorted(names)
     if layer is None and ("" in names or len(names) == 1):
@@ -127,4 +150,5 @@ def choose(path: StrPath, what: str, names: Iterable[str], layer: str | None) ->
     if layer in names:
         return str(layer)
     wanted = "one layer" if layer is None else f"a layer `{layer}`"
-    raise ValueError(f"`{path}` must have {wanted} with {what}, got such layers: {names}.")
+    got = f"such layers: {names}" if names else f"none among {sorted(others)}"
+    raise ValueError(f"`{path}` must have {wanted} with {what}, got {got}.")

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxfx import exr
 from jaxfx._extras import needs
 from jaxfx._files import StrPath
-from jaxfx.exr.rgbd import choose, images_of
+from jaxfx.exr.rgbd import choose_image, images_of
 from jaxfx.io._pixels import jpeg_values, log_profile
 from jaxfx.io.png import decode_png, linear_from_srgb
 
@@ -53,8 +53,7 @@ def read_color(
     if data.startswith(EXR):
         layers = exr.read(path)
         images, named = images_of(layers)
-        fewest = named if layer is None and "" not in images and named else images
-        return layers[images[choose(path, "an image", fewest, layer)]].astype(np.float32)
+        return layers[images[choose_image(path, images, named, layer)]].astype(np.float32)
     if layer is not None:
         raise ValueError(f"`{path}` must be an EXR file to have a layer `{layer}`.")
     if data.startswith(PNG):

@@ -63,8 +63,9 @@ def shade(
       out.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`. Exactly 0 where the
-    shader is -1 or the depth inf. A NaN in one pixel stays there. A roughness below 1e-4 counts
-    as 1e-4, and a light nearer to the surface than 1e-5 scene units fades out.
+    shader is -1, the depth inf or missing (0, negative, NaN). A NaN elsewhere stays in its
+    pixel. A roughness below 1e-4 counts as 1e-4, and a light nearer to the surface than 1e-5
+    scene units fades out.
 
     **Raises:** `ValueError` for a wrong shape, an unknown light or shader, or a visibility
     outside [0, 1]. Traced values can't be looked at: any shader but 0, 1 and 2 is black, and a
@@ -134,7 +135,8 @@ def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> 
     """The surface in every pixel; where there is none, shader -1 and harmless numbers."""
     dtype = working_dtype(gbuffer.color.dtype)
     shader = gbuffer.shader.astype(jnp.int32)
-    shown = (shader > _NOTHING) & (shader <= _BLINN) & (gbuffer.depth != jnp.inf)
+    is_somewhere = (gbuffer.depth > 0) & (gbuffer.depth != jnp.inf)
+    shown = (shader > _NOTHING) & (shader <= _BLINN) & is_somewhere
     shiny = shown & (shader >= _PHONG)
 
     def known(field: Array, otherwise: int, where: Array = shown) -> Array:

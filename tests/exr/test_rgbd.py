@@ -82,6 +82,8 @@ def test_two_view_layers_are_an_image_and_what_is_behind_it(tmp_path):
         ),
         ([f"L.Combined.left.{c}" for c in "RGBA"], "L.Depth.left.Z"),
         ([f"beauty.{c}" for c in "RGBA"], "Z"),
+        (["R", "G", "B", "A"], "ViewLayer.Depth.Z"),
+        ([f"a.Combined.{c}" for c in "RGBA"], "b.Depth.Z"),
     ],
 )
 def test_names_of_other_renderers(tmp_path, color, z):
@@ -179,6 +181,13 @@ def test_pixels_that_lie_elsewhere_are_refused(tmp_path):
 def test_a_file_without_depth_names_its_layers(tmp_path):
     exr.write(tmp_path / "a.exr", {"": image(), "AO": depth(0)})
     with pytest.raises(
-        ValueError, match=r"a.exr` must have one layer with an image and a depth"
+        ValueError, match=r"a.exr` must have one layer with an image and a depth, got none.*AO"
     ):
+        exr.read_rgbd(tmp_path / "a.exr")
+
+
+def test_an_image_before_two_depths_is_a_choice(tmp_path):
+    layers = {"": image(), "near.depth": depth(0), "far.depth": depth(0)}
+    exr.write(tmp_path / "a.exr", layers)
+    with pytest.raises(ValueError, match=r"a.exr` must .* a depth, got .*\['far', 'near'\]"):
         exr.read_rgbd(tmp_path / "a.exr")

@@ -217,8 +217,11 @@ def test_a_nan_stays_in_its_pixel_and_is_not_hidden(field, shader):
     wrong = eqx.tree_at(select, gbuffer, select(gbuffer).at[pixel].set(jnp.nan))
     rest = make_camera("pinhole", 7, 9), list(LIGHTS.values())
     good, bad = (image_and_slopes(gbuffer, *rest)[:2] for gbuffer in (gbuffer, wrong))
-    is_read = shader > 0 or field not in ("specular", "roughness")
-    assert np.isnan(bad[0][pixel]).all() == is_read
+    if field == "depth":  # A hole, where there is nothing to light.
+        np.testing.assert_array_equal(bad[0][pixel], 0)
+    else:
+        is_read = shader > 0 or field not in ("specular", "roughness")
+        assert np.isnan(bad[0][pixel]).all() == is_read
     for one, other in zip(jax.tree.leaves(good), jax.tree.leaves(bad), strict=True):
         assert np.isfinite(one).all()
         assert np.array_equal(one[elsewhere], other[elsewhere])
@@ -238,6 +241,21 @@ def test_background_is_black_whatever_it_holds():
     assert np.all(result[0][nothing] == 0)
     assert np.all(result[0][~nothing] > 0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
+
+
+@pytest.mark.parametrize("hole", [0.0, -1.0, np.nan, -np.inf, np.inf])
+def test_a_hole_in_depth_is_black_and_no_other_pixel_knows(hole):
+    gbuffer, rest = make_gbuffer(6), (make_camera("pinhole", 7, 9), list(LIGHTS.values()))
+    missing = np.zeros((7, 9), bool)
+    missing[2:4, 3:7] = True
+    depth = jnp.where(missing, hole, gbuffer.depth)
+    holed = eqx.tree_at(lambda gbuffer: gbuffer.depth, gbuffer, depth)
+    (good, *_), (found, slopes, *others) = (
+        image_and_slopes(gbuffer, *rest) for gbuffer in (gbuffer, holed)
+    )
+    np.testing.assert_array_equal(found, np.where(missing[..., None], 0, good))
+    np.testing.assert_array_equal(slopes.depth[missing], 0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((slopes, others)))
 
 
 @first("light", LIGHTS.values(), ids=LIGHTS.keys())
