@@ -1,4 +1,4 @@
-"""Damaged glTF and OBJ files: an error that names the file, or what another reader reads."""
+"""Damaged glTF, OBJ and PLY files: an error that names the file, or what another reader reads."""
 
 import base64
 import itertools
@@ -292,6 +292,90 @@ def test_damaged_obj(tmp_path):
             damaged = OBJ[:at] + letter + OBJ[at + random.integers(0, 2) :]
         path.write_text(damaged)
         raised += check(path, obj_triangles)
+    assert COUNT / 5 < raised < COUNT
+
+
+# Another reader of PLY in letters: word by word, each element as its header says.
+
+
+def ply_triangles(path):
+    header, _, body = path.read_text().partition("end_header\n")
+    elements, tables = [], {}
+    for line in header.splitlines():
+        word, *rest = line.split() or [""]
+        if word == "element":
+            elements.append((rest[0], int(rest[1]), []))
+        if word == "property":
+            elements[-1][2].append((rest[-1], rest[0] == "list"))
+    words = iter(body.split())
+    for name, count, properties in elements:
+        tables[name] = [
+            {
+                key: [float(next(words)) for _ in range(int(next(words)))]
+                if is_list
+                else float(next(words))
+                for key, is_list in properties
+            }
+            for _ in range(count)
+        ]
+    points = [[row["x"], row["y"], row["z"]] for row in tables["vertex"]]
+    faces = [row.get("vertex_indices", row.get("vertex_index")) for row in tables["face"]]
+    return [
+        [points[int(face[0])], points[int(face[i])], points[int(face[i + 1])]]
+        for face in faces
+        for i in range(1, len(face) - 1)
+    ]
+
+
+PLY = """ply
+format ascii 1.0
+comment a pyramid
+element vertex 5
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+element note 2
+property list uchar short words
+element face 3
+property uchar flag
+property list uchar int vertex_indices
+end_header
+0 0 0 255 0 0
+2.5 0 0 0 255 0
+2.5 1.5 0 0 0 255
+0 1.5 0 9 9 9
+1.25 0.75 -2e0 8 8 8
+3 1 2 3
+0
+7 4 0 1 2 3
+0 3 0 4 1
+1 3 1 4 2
+"""
+
+
+def test_damaged_ply(tmp_path):
+    random = np.random.default_rng(0)
+    path = tmp_path / "damaged.ply"
+    path.write_text(PLY)
+    assert check(path, ply_triangles) == 0
+    raised = 0
+    for i in range(COUNT):
+        at = random.integers(len(PLY))
+        if i % 4 == 0:
+            damaged = PLY[:at]
+        elif i % 4 == 1:
+            lines = PLY.splitlines(keepends=True)
+            del lines[random.integers(len(lines))]
+            damaged = "".join(lines)
+        else:
+            letters = "0123456789-. vf\n" if i % 4 == 2 else "".join(map(chr, range(32, 127)))
+            letter = letters[random.integers(len(letters))]
+            damaged = PLY[:at] + letter + PLY[at + random.integers(0, 2) :]
+        path.write_text(damaged)
+        raised += check(path, ply_triangles)
     assert COUNT / 5 < raised < COUNT
 
 
