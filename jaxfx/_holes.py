@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 # In units of the image's longer side: what a step across all of the guide's range costs, and
 # what a path pays at the rim of the hole where its depth is too near, by more than the ratio.
-EDGE = 1.25
+EDGE = 2.0
 JUMP = 0.4
 RATIO = 1.1
 # Costs are whole numbers, this many to a pixel's side. So sums are exact, and a pixel has the
@@ -65,16 +65,18 @@ def cheapest_sources(
 ) -> Source:
     """The source at the end of the cheapest path to each pixel, by steps across pixels' sides.
 
-    A step costs its length, and more where `guide` (linear, 0 to 1) changes. A path pays where
-    it leaves the known pixels with a depth that is nearer than `expected` there. The pixels of
-    one source hang together by their sides.
+    A step costs its length, and more where `guide` (linear, 0 to 1) changes by more than it
+    does all about: what is alike everywhere is a texture, no edge. A path pays where it leaves
+    the known pixels with a depth that is nearer than `expected` there. The pixels of one
+    source hang together by their sides.
     """
     height, width = depth.shape
     shown = jnp.sqrt(jnp.clip(jnp.nan_to_num(guide), 0, 1))
+    planes = shown, _texture(shown), depth, expected
     unit = max(height, width)
     # A quarter turn for each of the four directions from which a step can come.
     steps = [
-        _steps_down(*(jnp.rot90(plane, turn) for plane in (shown, depth, expected)), unit=unit)
+        _steps_down(*(jnp.rot90(plane, turn) for plane in planes), unit=unit)
         for turn in range(4)
     ]
     known = jnp.where(jnp.isnan(depth), jnp.int32(BEYOND), jnp.int32(0))
@@ -92,11 +94,28 @@ def cheapest_sources(
     return source
 
 
+def _texture(guide: Float[Array, "height width channel"]) -> Plane:
+    """The mean step of `guide` from a pixel to its sides, over the 3 x 3 about each."""
+    padded = jnp.pad(guide, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    beside = padded[2:, 1:-1], padded[:-2, 1:-1], padded[1:-1, 2:], padded[1:-1, :-2]
+    mean = sum(jnp.mean(jnp.abs(guide - other), axis=2) for other in beside) / 4
+    for _ in range(2):
+        padded = jnp.pad(mean, ((1, 1), (0, 0)), mode="edge")
+        mean = ((padded[2:] + padded[1:-1] + padded[:-2]) / 3).T
+    return mean
+
+
 def _steps_down(
-    guide: Float[Array, "height width channel"], depth: Plane, expected: Plane, *, unit: int
+    guide: Float[Array, "height width channel"],
+    texture: Plane,
+    depth: Plane,
+    expected: Plane,
+    *,
+    unit: int,
 ) -> Cost:
     """What the step to each pixel from the one above it costs; beyond all in the first row."""
-    edge = jnp.mean(jnp.abs(guide[1:] - guide[:-1]), axis=2)
+    change = jnp.mean(jnp.abs(guide[1:] - guide[:-1]), axis=2)
+    edge = jnp.maximum(change - jnp.minimum(texture[1:], texture[:-1]), 0)
     # Not so where the depth above is missing.
     jump = jnp.where(expected[1:] > RATIO * depth[:-1], JUMP, 0.0)
     cost = 1 + unit * (EDGE * edge + jump)

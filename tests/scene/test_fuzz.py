@@ -1,4 +1,4 @@
-"""Damaged glTF, OBJ and PLY files: an error that names the file, or what another reader reads."""
+"""Damaged glTF, OBJ and PLY files: an error that names them, or what another reader reads."""
 
 import base64
 import itertools
