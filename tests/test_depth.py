@@ -259,11 +259,14 @@ def test_the_image_guides(hole):
 
 
 def test_the_shadow_beside_a_near_thing_is_behind_it():
-    """In grey alone, where the image says nothing, the farther side of the gap goes on."""
+    """Where the image says nothing, plain or in a texture, the farther side goes on."""
     _, values, _ = scene()
     shadow = holes()["beside"]
-    found = depth.fill(np.where(shadow, 0, values), np.full((48, 64, 3), 0.5))
-    assert (found.depth[shadow] > 2).all()
+    checks = np.where(np.indices((48, 64)).sum(axis=0) % 2, 0.9, 0.1)
+    noise = np.random.default_rng(7).uniform(size=(48, 64, 3))
+    for guide in (np.full((48, 64, 3), 0.5), np.stack([checks] * 3, axis=-1), noise):
+        found = depth.fill(np.where(shadow, 0, values), guide)
+        assert (found.depth[shadow] > 2).all()
 
 
 @first("hole", holes())
