@@ -4,9 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from jaxfx import relight
-from jaxfx.relight import shading
+from jaxfx.relight import holes, shading
+from tests.relight.test_holes import (  # noqa: F401
+    test_a_filled_pixel_has_the_derivative_of_the_one_it_was_taken_from,
+    test_any_size,
+    test_is_the_nearest_covered_pixel,
+    test_nothing_covered_leaves_everything,
+)
 from tests.relight.test_shading import (  # noqa: F401
     LIGHTS,
     loop,
@@ -49,3 +56,24 @@ def test_groups_of_lights_and_what_is_left_over(more):
     slope = jax.grad(lambda color: jnp.sum(colored(color)))(lights[0].color)
     alone = loop(gbuffer, camera, lights[0]) / np.asarray(lights[0].color)
     np.testing.assert_allclose(slope, alone.sum(axis=(0, 1)), rtol=1e-10)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.02, 0.9])
+def test_both_searches_across_find_the_same_pixel(share):
+    """Wider than the first pass reaches: distances by SciPy, and equal ones broken alike."""
+    rng = np.random.default_rng(0)
+    covered = rng.random((40, 4 * holes._NEAR)) < share
+    both = []
+    for search in (holes._widening, holes._in_two_passes):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(holes, "by_platform", lambda *x, cpu, accelerator, f=search: f(*x))
+            both.append(holes._nearest(jnp.asarray(covered), jnp.asarray(~covered)))
+    (found, near), (same, other) = both
+    np.testing.assert_array_equal(found, same)
+    assert found.all() == covered.any()
+    if covered.any():
+        np.testing.assert_array_equal(near, other)
+        row, column = np.divmod(near, covered.shape[1])
+        y, x = np.indices(covered.shape)
+        distance = ndimage.distance_transform_edt(~covered)
+        np.testing.assert_allclose(np.hypot(row - y, column - x), distance, atol=1e-12)
