@@ -63,20 +63,23 @@ def _one_by_one(surface: Surface, sums: Sums, terms: Any) -> Sums:
         *light, sign = term
         # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once,
         # with a third less work; that of 0.10 drops the barrier and computes them anew.
-        shares = jax.lax.optimization_barrier(_shares(surface, *light))
-        return _with_term(sums, *shares, sign), None
+        diffuse, specular = jax.lax.optimization_barrier(_shares(surface, *light))
+        return _with_term(sums, diffuse, specular, sign), None
 
     return jax.lax.scan(step, sums, terms)[0]
 
 
 def _in_pairs(surface: Surface, sums: Sums, terms: Any) -> Sums:
-    """Shaded two at a time, and added one after another. An edit is one such pair."""
+    """Shaded two at a time, and added one after another.
+
+    An edit is one such pair; what one edit put in, the next takes out by the same program.
+    """
 
     def add(sums, some):
         *lights, signs = some
-        shares = jax.vmap(lambda light: _shares(surface, *light))(lights)
+        diffuse, specular = jax.vmap(lambda light: _shares(surface, *light))(lights)
         for i in range(len(signs)):
-            sums = _with_term(sums, *(share[i] for share in shares), signs[i])
+            sums = _with_term(sums, diffuse[i], specular[i], signs[i])
         return sums
 
     return in_groups(add, sums, terms, 2)

@@ -226,7 +226,8 @@ def _walk_in_step(pyramid, r, state, steps, max_steps):
     """All rays step until the last of them is done."""
 
     def goes_on(carry):
-        return jnp.any(_alive(*carry, max_steps))
+        state, steps = carry
+        return jnp.any(_alive(state, steps, max_steps))
 
     def body(carry):
         state, steps = carry
