@@ -6,7 +6,6 @@ import pytest
 from benchmarks.scenes.reproject import run
 from tests.cases.reproject import awkward_rays, field
 from tests.reproject.test_blend import (  # noqa: F401
-    test_one_source_is_a_warp,
     test_the_choice_is_what_shows_most_and_then_what_it_lacks,
     test_the_nearer_surface_hides_the_farther,
     test_two_sources_fill_each_others_gaps,
@@ -18,7 +17,6 @@ from tests.reproject.test_intersect import (  # noqa: F401
 )
 from tests.reproject.test_walk import test_a_bound_on_steps_is_kept_and_said  # noqa: F401
 from tests.reproject.test_warp import (  # noqa: F401
-    test_a_plane_moves_by_its_homography,
     test_derivatives_of_the_pose_and_the_depth_are_the_difference_quotients,
     test_under_vmap_and_in_any_shape,
 )
