@@ -1,19 +1,18 @@
 """What many lights bring to a surface, as sums that a light can be taken out of again.
 
 Two things keep a long chain of changes true. The sums carry along what rounding takes from
-them; and what is put in and what is taken out pass through the same compiled steps, and so are
+them; and what is put in and what is taken out pass through the same compiled loop, and so are
 the same to the last bit.
 """
 
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx._platform import by_platform
 from jaxfx.light import AmbientLight, Light
-from jaxfx.relight.shading import Surface, in_groups, received, seen, stacked
+from jaxfx.relight.shading import Surface, received, seen, stacked
 
 
 _Image = Float[Array, "height width 3"]
@@ -53,48 +52,23 @@ def changed(surface, sums, lights, visibility, signs):
             continue
         group = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lights[i] for i in which))
         shadows = stacked([visibility[i] for i in which], surface)
-        terms = surface, sums, (group, shadows, signs[jnp.array(which)])
-        sums = by_platform(*terms, cpu=_one_by_one, accelerator=_in_pairs)
+        step = lambda sums, term: (_with_term(surface, sums, *term), None)
+        sums, _ = jax.lax.scan(step, sums, (group, shadows, signs[jnp.array(which)]))
     return sums
 
 
-def _one_by_one(surface: Surface, sums: Sums, terms: Any) -> Sums:
-    def step(sums, term):
-        *light, sign = term
-        # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once,
-        # with a third less work; that of 0.10 drops the barrier and computes them anew.
-        diffuse, specular = jax.lax.optimization_barrier(_shares(surface, *light))
-        return _with_term(sums, diffuse, specular, sign), None
-
-    return jax.lax.scan(step, sums, terms)[0]
-
-
-def _in_pairs(surface: Surface, sums: Sums, terms: Any) -> Sums:
-    """Shaded two at a time, and added one after another.
-
-    An edit is one such pair; what one edit put in, the next takes out by the same program.
-    """
-
-    def add(sums, some):
-        *lights, signs = some
-        diffuse, specular = jax.vmap(lambda light: _shares(surface, *light))(lights)
-        for i in range(len(signs)):
-            sums = _with_term(sums, diffuse[i], specular[i], signs[i])
-        return sums
-
-    return in_groups(add, sums, terms, 2)
-
-
-def _shares(
-    surface: Surface, light: Any, visibility: Float[Array, "height width"] | None
-) -> tuple[_Image, _Image]:
-    """What a light brings for the diffuse and for the specular reflectance to multiply."""
+def _with_term(
+    surface: Surface,
+    sums: Sums,
+    light: Light,
+    visibility: Float[Array, "height width"] | None,
+    sign: Float[Array, ""],
+) -> Sums:
     shares = jax.checkpoint(received, prevent_cse=False)(surface, light)
-    diffuse, specular = (seen(surface, share, visibility) for share in shares)
-    return diffuse, specular
-
-
-def _with_term(sums: Sums, diffuse: _Image, specular: _Image, sign: Float[Array, ""]) -> Sums:
+    shares = tuple(seen(surface, share, visibility) for share in shares)
+    # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once, with
+    # a third less work; that of 0.10 drops the barrier and computes them again for each.
+    diffuse, specular = jax.lax.optimization_barrier(shares)
     finite = jnp.isfinite(diffuse).all(axis=-1) & jnp.isfinite(specular).all(axis=-1)
     signed = lambda share: jnp.where(finite[..., None], sign * share, 0)
     return Sums(

@@ -8,7 +8,7 @@ Cosines near 1 are kept as `1 - cosine`, half the squared distance between unit 
 highlights and narrow cones are not lost to cancellation, and no cosine exceeds 1.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, get_args
 
@@ -315,16 +315,13 @@ def _together(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
     @partial(jax.checkpoint, prevent_cse=False)
     def add(image, some):
         bring = lambda term: seen(surface, reflected(surface, term[0]), term[1])
-        return image + jnp.sum(jax.vmap(bring)(some), axis=0)
+        return image + jnp.sum(jax.vmap(bring)(some), axis=0), None
 
-    return in_groups(add, image, terms, _TOGETHER)
-
-
-def in_groups(add: Callable[[Any, Any], Any], start: Any, terms: Any, size: int) -> Any:
-    """`start` after `add(sum, some)` for groups of stacked terms; the last may be smaller."""
     count = len(jax.tree.leaves(terms)[0])
-    whole = count - count % size
-    groups = jax.tree.map(lambda x: x[:whole].reshape(-1, size, *x.shape[1:]), terms)
+    whole = count - count % _TOGETHER
     if whole:
-        start = jax.lax.scan(lambda so_far, some: (add(so_far, some), None), start, groups)[0]
-    return add(start, jax.tree.map(lambda x: x[whole:], terms)) if whole < count else start
+        groups = lambda x: x[:whole].reshape(-1, _TOGETHER, *x.shape[1:])
+        image, _ = jax.lax.scan(add, image, jax.tree.map(groups, terms))
+    if whole < count:
+        image, _ = add(image, jax.tree.map(lambda x: x[whole:], terms))
+    return image

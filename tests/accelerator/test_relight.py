@@ -23,17 +23,6 @@ from tests.relight.test_shading import (  # noqa: F401
     test_render_is_the_sum_of_lights,
     test_render_with_shadows_is_the_sum_of_shaded_lights,
 )
-from tests.relight.test_state import (  # noqa: F401
-    test_a_bad_pixel_stays_where_it_is,
-    test_a_bright_light_leaves_no_trace,
-    test_a_chain_of_edits_of_several_kinds_does_not_drift,
-    test_a_light_that_is_not_finite_leaves_no_trace,
-    test_derivatives_in_the_cache_are_those_of_render,
-    test_derivatives_in_the_edited_light_are_those_of_shading_it,
-    test_every_method_gives_the_picture_of_its_lights,
-    test_ten_thousand_edits_in_a_loop_do_not_drift,
-    test_visibility_goes_with_its_light,
-)
 
 
 @pytest.mark.parametrize("more", [0, 3])
