@@ -16,6 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxfx._linear import linear
+from jaxfx._platform import by_platform
 
 
 Sampling = Literal["discrete", "linear"]
@@ -237,7 +238,11 @@ def _added_in_groups(image: Array, terms: list[Callable[[], Array]]) -> Array:
 
 
 def apart(image: Array, compute: Callable[[], Array]) -> Array:
-    """What `compute` returns, in a branch that is always taken: XLA moves nothing across it."""
+    """What `compute` returns, kept in memory: XLA moves nothing across it.
+
+    On a CPU it is a branch that is always taken, for which an accelerator's host would wait.
+    """
     shape = jax.eval_shape(compute)
     nothing = lambda: jnp.zeros(shape.shape, shape.dtype)
-    return lax.cond(image.reshape(-1)[0] < -jnp.inf, nothing, compute)
+    branch = lambda: lax.cond(image.reshape(-1)[0] < -jnp.inf, nothing, compute)
+    return by_platform(cpu=branch, accelerator=lambda: lax.optimization_barrier(compute()))

@@ -1,4 +1,4 @@
-"""Square roots, norms and quotients with finite gradients.
+"""Square roots, norms and quotients with finite gradients; the inverse of a small matrix.
 
 The floor under everything else: arrays only, no types of this package.
 """
@@ -59,6 +59,17 @@ def normalize(vector: Float[Array, "... n"]) -> Float[Array, "... n"]:
     """Unit vectors along the last axis; the zero vector stays zero, with zero derivative."""
     length = safe_sqrt(jnp.sum(vector * vector, axis=-1, keepdims=True))
     return safe_divide(vector, length)
+
+
+def inverse(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The inverse, by cofactors.
+
+    A decomposition is a chain of calls that nothing can be fused with: ten launches, and as
+    many again for its derivative.
+    """
+    first, second, third = matrix
+    columns = jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)
+    return jnp.stack(columns, axis=1) / jnp.sum(first * columns[0])
 
 
 @jax.custom_jvp

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfx._arguments import check_camera
 from jaxfx._checks import as_numpy, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
-from jaxfx._numerics import working_dtype
+from jaxfx._numerics import inverse, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 
@@ -180,7 +180,7 @@ def _axis_per_ray(
     """How far along the axis one goes in each pixel, for a unit along its ray."""
     height, width = like.shape
     pixels = pixel_centers(height, width, like.dtype)
-    columns = jnp.linalg.inv(camera.intrinsics).astype(like.dtype).T[:, None, None, :]
+    columns = inverse(camera.intrinsics).astype(like.dtype).T[:, None, None, :]
     rays = pixels[..., :1] * columns[0] + pixels[..., 1:] * columns[1] + columns[2]
     return rays[..., 2] / jnp.linalg.norm(rays, axis=-1)
 

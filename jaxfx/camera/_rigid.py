@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._checks import check, check_fields, check_map, parameter
-from jaxfx._numerics import common_dtype, normalize, working_dtype
+from jaxfx._numerics import common_dtype, inverse, normalize, working_dtype
 from jaxfx._sampling import pixel_centers
 
 
@@ -120,7 +120,7 @@ def per_depth(camera: Any, pixels: Float[Array, "... 2"]) -> Float[Array, "... 3
     """
     turn, pixels = camera.world_from_camera[:3, :3], homogeneous(pixels)
     if hasattr(camera, "intrinsics"):
-        return transformed(turn, transformed(jnp.linalg.inv(camera.intrinsics), pixels))
+        return transformed(turn, transformed(inverse(camera.intrinsics), pixels))
     return each(turn[:, 2], pixels)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
-from jaxfx._numerics import normalize, working_dtype
+from jaxfx._numerics import inverse, normalize, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import _conventions
 from jaxfx.camera._rigid import (
@@ -289,7 +289,7 @@ class PinholeCamera(eqx.Module):
         check_fields("PinholeCamera.rays", self)
         dtype = self.intrinsics.dtype
         pixels = pixel_centers(*_size("rays", height, width), working_dtype(dtype))
-        local = transformed(jnp.linalg.inv(self.intrinsics), homogeneous(pixels))
+        local = transformed(inverse(self.intrinsics), homogeneous(pixels))
         directions = normalize(transformed(self.world_from_camera[:3, :3], local)).astype(dtype)
         eye = self.world_from_camera[:3, 3].astype(dtype)
         return jnp.broadcast_to(eye, directions.shape), directions
@@ -345,7 +345,7 @@ class PinholeCamera(eqx.Module):
         **Gradient:** exact.
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
-        rays = transformed(jnp.linalg.inv(self.intrinsics), homogeneous(pixels))
+        rays = transformed(inverse(self.intrinsics), homogeneous(pixels))
         return to_world(self.world_from_camera, rays * depth[..., None]).astype(dtype)
 
     def through_lens(self, offset: Any, *, focus_distance: Any) -> "PinholeCamera":

@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._checks import Number, check, parameter
+from jaxfx._platform import by_platform
 from jaxfx.dof._inputs import Defocused, check_arguments, defocused
 from jaxfx.lens import Lens
 
@@ -197,11 +198,12 @@ def solve(
         ends = ((0, 1), (0, 0), (0, 0)), ((1, 0), (0, 0), (0, 0))
         return x - jnp.pad(flow, ends[0]) + jnp.pad(flow, ends[1])
 
-    def thomas(_, heat):
-        return _thomas(jax.lax.stop_gradient(conductance), heat)
+    def direct(_, heat):
+        held = jax.lax.stop_gradient(conductance)
+        return by_platform(held, heat, cpu=_thomas, accelerator=_cyclic_reduction)
 
     # The matrix is symmetric: an adjoint is one more solve.
-    return jax.lax.custom_linear_solve(matvec, heat, thomas, symmetric=True)
+    return jax.lax.custom_linear_solve(matvec, heat, direct, symmetric=True)
 
 
 def _thomas(
@@ -234,3 +236,34 @@ def _thomas(
 
     _, x = jax.lax.scan(substitute, jnp.zeros_like(heat[0]), (known, ratio), reverse=True)
     return x
+
+
+def _cyclic_reduction(
+    conductance: Float[Array, "border 1 lane"], heat: Float[Array, "size channel lane"]
+) -> Float[Array, "size channel lane"]:
+    """Elimination of all unknowns at once, also without a difference (Hockney 1965).
+
+    A row is `(excess + left + right) x[i] - left x[i - reach] - right x[i + reach] = heat[i]`.
+    The rows at `i - reach` and `i + reach`, so many times that their unknowns drop out, are
+    added to it: then it reaches twice as far, and after log2(size) turns beyond both ends.
+    """
+    left = jnp.pad(conductance, ((1, 0), (0, 0), (0, 0)))
+    right = jnp.pad(conductance, ((0, 1), (0, 0), (0, 0)))
+    excess, zero = jnp.ones_like(left), jnp.zeros((), heat.dtype)
+    reach, size = 1, len(heat)
+
+    def moved(x: Array, by: int) -> Array:
+        """Each row's that lies `by` rows before it; 0 beyond the ends."""
+        return jax.lax.pad(x, zero, ((by, -by, 0), (0, 0, 0), (0, 0, 0)))
+
+    while reach < size:
+        per_pivot = 1 / (excess + left + right)
+        before, after = left * moved(per_pivot, reach), right * moved(per_pivot, -reach)
+
+        def added(x, reach=reach, before=before, after=after):
+            return x + before * moved(x, reach) + after * moved(x, -reach)
+
+        heat, excess = added(heat), added(excess)
+        left, right = before * moved(left, reach), after * moved(right, -reach)
+        reach *= 2
+    return heat / excess

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._checks import Number, check, parameter
 from jaxfx._numerics import absolute
+from jaxfx._platform import by_platform
 from jaxfx.dof._inputs import OWN, check_arguments, defocused
 from jaxfx.dof._sprites import POINT_RADIUS, coverage, leak_rejection, reach
 from jaxfx.lens import Lens
@@ -21,6 +22,8 @@ _HALF_SIDE = math.sqrt(3) / 4
 _SMALLEST_EPSILON = 1e-6
 # Rows that are passed over at once: what a tap reads and adds to then stays in the cache.
 _BAND = 16
+# Taps that an accelerator adds in one launch: more take longer to compile.
+_TOGETHER = 6
 
 
 def separable(
@@ -89,9 +92,11 @@ def _separable(image, depth, lens, epsilon, max_coc):
     # What leaks onto a pixel of unknown depth is not known: all of it is taken.
     coc = jnp.where(view.missing, max_coc, coc)
     planes = picture, half, leak, coc, jnp.where(view.missing, 0, jnp.ones_like(coc))
+    in_bands = ft.partial(_in_bands, far=far)
+    at_once = ft.partial(_along_rows, far=far, together=_TOGETHER)
     for _ in range(2):
         # Turned over after each pass: the second is along columns.
-        picture = _in_bands(planes, epsilon, far)
+        picture = by_platform(planes, epsilon, cpu=in_bands, accelerator=at_once)
         planes = tuple(plane.swapaxes(-1, -2) for plane in (picture, *planes[1:]))
     result = jnp.moveaxis(planes[0], 0, -1)
     return jnp.where(view.lost[..., None], jnp.nan, result).astype(image.dtype)
@@ -110,9 +115,8 @@ def _in_bands(
         shape = (*plane.shape[:-2], -1, band, plane.shape[-1])
         return jnp.moveaxis(plane.reshape(shape), -3, 0)
 
-    def one(bands):
-        picture, half, leak, coc, known = bands
-        return _along_rows(picture, half, leak, coc, known, epsilon, far)
+    def one(planes):
+        return _along_rows(planes, epsilon, far, together=1)
 
     passed = jax.lax.map(one, tuple(split(plane) for plane in planes))
     channels, width = planes[0].shape[0], planes[0].shape[-1]
@@ -120,39 +124,44 @@ def _in_bands(
 
 
 def _along_rows(
-    image: Float[Array, "channel height width"],
-    half: Float[Array, "height width"],
-    leak: Float[Array, "height width"],
-    coc: Float[Array, "height width"],
-    known: Float[Array, "height width"],
-    epsilon: Float[Array, ""],
-    far: int,
+    planes: tuple[Float[Array, "..."], ...], epsilon: Float[Array, ""], far: int, together: int
 ) -> Float[Array, "channel height width"]:
     """One pass: the mean of the pixels of a row whose segments reach each of its pixels.
 
-    Those that are not `known` have none, and a little weight for themselves.
+    Those that are not `known` have none, and a little weight for themselves. So many taps are
+    added `together`, in one launch of an accelerator.
     """
-    width = coc.shape[1]
+    image, half, leak, coc, known = planes
+    width, count = coc.shape[1], -(-(2 * far + 1) // together) * together
 
     def pad(x, fill):
-        return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(far, far)], constant_values=fill)
+        # Beyond the last offset there are as many more as fill the last group: no weight.
+        room = [(0, 0)] * (x.ndim - 1) + [(count - far - 1, far)]
+        return jnp.pad(x, room, constant_values=fill)
 
     padded = pad(image, 0), pad(half, POINT_RADIUS), pad(leak, -1)
     counts = pad(known, 0)
 
     def add_tap(sums, column):
         def seen(x):
-            return jax.lax.dynamic_slice_in_dim(x, far - column, width, axis=-1)
+            start = count - far - 1 - column
+            return jax.lax.dynamic_slice_in_dim(x, start, width, axis=-1)
 
         color, half, leak = map(seen, padded)
         weight = seen(counts) * coverage(half, column) / (2 * half)
         weight = weight * leak_rejection(leak, coc, epsilon)
         # What has no share is not looked at: it may be no number.
         part = weight[None] * jnp.where(weight[None] == 0, 0, color)
-        return (sums[0] + part, sums[1] + weight), None
+        return sums[0] + part, sums[1] + weight
+
+    @jax.checkpoint
+    def add_taps(sums, columns):
+        for i in range(together):
+            sums = add_tap(sums, columns[i])
+        return sums, None
 
     own = jnp.where(known == 0, OWN, jnp.zeros_like(coc))
     start = jnp.where(known[None] == 0, OWN * image, 0), own
-    offsets = jnp.arange(-far, far + 1)
-    (sums, weights), _ = jax.lax.scan(jax.checkpoint(add_tap), start, offsets)
+    offsets = jnp.arange(count) - far
+    (sums, weights), _ = jax.lax.scan(add_taps, start, offsets.reshape(-1, together))
     return sums / weights[None]

@@ -9,6 +9,7 @@ highlights and narrow cones are not lost to cancellation, and no cosine exceeds 
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple, get_args
 
 import jax
@@ -19,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._checks import check, share, shares
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
+from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
@@ -31,6 +33,8 @@ _NOTHING, _PHONG, _BLINN = -1, 1, 2
 # A pixel's vector that is shorter (scene units, for the way to a light) is divided by this in
 # place of its length, and so fades to zero: even float32's second derivatives stay finite.
 _SHORTEST = 1e-5
+# So many lights are shaded at once on an accelerator, each in the memory of some images.
+_TOGETHER = 8
 _SMOOTHEST = 1e-4  # A smaller roughness is this: a highlight far narrower than a pixel.
 
 
@@ -283,17 +287,43 @@ def _shade(gbuffer, camera, light, visibility):
 def _render(gbuffer, camera, lights, visibilities):
     surface = to_surface(gbuffer, camera)
     image = jnp.zeros_like(surface.position)
-    again = jax.checkpoint(reflected, prevent_cse=False)
     stack = lambda *leaves: jnp.stack([leaf.astype(image.dtype) for leaf in leaves])
-
-    def add(image, term):
-        light, visibility = term
-        return image + seen(surface, again(surface, light), visibility), None
-
     for kind in get_args(Light):
         which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
         if which:
             group = jax.tree.map(stack, *(lights[i] for i in which))
             shadows = stacked([visibilities[i] for i in which], surface)
-            image, _ = jax.lax.scan(add, image, (group, shadows))
+            terms = surface, image, (group, shadows)
+            image = by_platform(*terms, cpu=_one_by_one, accelerator=_together)
     return image.astype(gbuffer.color.dtype)
+
+
+_again = jax.checkpoint(reflected, prevent_cse=False)
+
+
+def _one_by_one(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
+    """The image with lights of a kind added, one after another."""
+
+    def add(image, term):
+        light, visibility = term
+        return image + seen(surface, _again(surface, light), visibility), None
+
+    return jax.lax.scan(add, image, terms)[0]
+
+
+def _together(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
+    """The same, some lights at a time: a launch is for all of them."""
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def add(image, some):
+        bring = lambda term: seen(surface, reflected(surface, term[0]), term[1])
+        return image + jnp.sum(jax.vmap(bring)(some), axis=0), None
+
+    count = len(jax.tree.leaves(terms)[0])
+    whole = count - count % _TOGETHER
+    if whole:
+        groups = lambda x: x[:whole].reshape(-1, _TOGETHER, *x.shape[1:])
+        image, _ = jax.lax.scan(add, image, jax.tree.map(groups, terms))
+    if whole < count:
+        image, _ = add(image, jax.tree.map(lambda x: x[whole:], terms))
+    return image

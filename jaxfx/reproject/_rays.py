@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxfx._numerics import inverse
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 
 
@@ -74,7 +75,7 @@ def _lines(
     apart = turn @ (pose[:3, :3] - turn.T)
     if isinstance(target, PinholeCamera):
         target_lens = target.intrinsics.astype(dtype)
-        apart = ((lens - target_lens) + lens @ apart) @ jnp.linalg.inv(target_lens)
+        apart = ((lens - target_lens) + lens @ apart) @ inverse(target_lens)
         own, eye, plane = (x, y, one), lens @ (turn @ away), (zero, zero)
     else:
         apart = lens @ (apart + jnp.eye(3, dtype=dtype))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._platform import by_platform
 from jaxfx.reproject import _march, _walk
 from jaxfx.reproject._found import Found
 
@@ -43,18 +44,22 @@ _FOUND = jax.tree.structure(Found(*Found._fields))  # pyright: ignore[reportArgu
 
 @functools.cache
 def _searcher(method: str, max_steps: int | None, from_end: bool):
-    @jax.custom_batching.custom_vmap
-    def one(depth, origin, direction):
+    def alone(depth, origin, direction):
         return METHODS[method](depth, origin, direction, max_steps, from_end)
+
+    one = jax.custom_batching.custom_vmap(alone)
 
     @one.def_vmap
     def many(size, batched, depth, origin, direction):
-        # A loop under `vmap` would run every search as long as the longest of them.
         is_batched = jax.tree.unflatten(_FOUND, [True] * len(Found._fields))
         each = lambda x, is_mapped: x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
         origin, direction = each(origin, batched[1]), each(direction, batched[2])
         if batched[0]:
-            return jax.lax.map(lambda args: one(*args), (depth, origin, direction)), is_batched
+            # On a CPU a loop under `vmap` would run every search as long as the longest.
+            in_turn = lambda *args: jax.lax.map(lambda each: one(*each), args)
+            at_once = jax.vmap(alone)
+            args = depth, origin, direction
+            return by_platform(*args, cpu=in_turn, accelerator=at_once), is_batched
         found = one(depth, origin.reshape(-1, 3), direction.reshape(-1, 3))
         return jax.tree.map(lambda x: x.reshape(size, -1), found), is_batched
 

@@ -1,8 +1,11 @@
-"""The exact traversal of a minimum pyramid, many rays in step, the live ones kept together.
+"""The exact traversal of a minimum pyramid, many rays in step.
 
 The state of a ray is one integer: the texel in which it is, and the level at which it looks.
 Hence a step is one fused loop with one result, and the time of a ray follows from its texel.
-Every step reads all that is known of its rays: no more of them go in step than a cache holds.
+
+On a CPU the live rays are kept together. Every step reads all that is known of its rays: no
+more of them go in step than a cache holds. On an accelerator all rays go in step to the end,
+for there a step costs a launch, however many of them are done.
 """
 
 import math
@@ -12,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
+from jaxfx._platform import by_platform
 from jaxfx._pyramid import Pyramid, minimum_pyramid
 from jaxfx.reproject import _grid
 from jaxfx.reproject._found import START, TOP, X_SIDE, Y_SIDE, Found
@@ -29,6 +33,8 @@ _TOGETHER = 2**18
 _LANES = 64
 # One of so many rays goes on when the others are done.
 _GOES_ON = 3
+# So many steps for each look of an accelerator's host at whether any ray goes on.
+_TURN = 6
 # Down by so many levels where a ray reaches a depth; up by one beyond the border of the cell so
 # many levels above. A seventh fewer steps than by single levels.
 _AT_ONCE = 2
@@ -122,21 +128,25 @@ def walk(
     nearest = jnp.min(jnp.where(finite, depth, jnp.inf))
     thickness = jnp.max(jnp.where(finite, depth, -jnp.inf)) - nearest
 
-    def together(rays):
+    def together(rays, walk):
         begin, along = rays
         r = _grid.rays(begin, along, from_end)
         state, steps = _begin(pyramid, thickness, r)
-        return _end(pyramid, r, *_walk(pyramid, r, state, steps, limit))
+        return _end(pyramid, r, *walk(pyramid, r, state, steps, limit))
 
-    count = len(origin)
-    parts = -(-count // _TOGETHER)
-    if parts <= 1:
-        return together((origin, direction))
-    size = _even(count / parts)
-    room = ((0, parts * size - count), (0, 0))
-    split = lambda x: jnp.pad(x, room).reshape(parts, size, 3)
-    found = jax.lax.map(together, (split(origin), split(direction)))
-    return jax.tree.map(lambda x: x.reshape(-1)[:count], found)
+    def in_parts(*rays):
+        count = len(origin)
+        parts = -(-count // _TOGETHER)
+        if parts <= 1:
+            return together(rays, _walk)
+        size = _even(count / parts)
+        room = ((0, parts * size - count), (0, 0))
+        split = tuple(jnp.pad(x, room).reshape(parts, size, 3) for x in rays)
+        found = jax.lax.map(lambda part: together(part, _walk), split)
+        return jax.tree.map(lambda x: x.reshape(-1)[:count], found)
+
+    in_step = lambda *rays: together(rays, _walk_in_step)
+    return by_platform(origin, direction, cpu=in_parts, accelerator=in_step)
 
 
 def _begin(pyramid: Pyramid, thickness: Array, r: Rays):
@@ -210,6 +220,24 @@ def _walk(pyramid, r, state, steps, max_steps):
             for x, end in zip((state, steps), ends, strict=True)
         )
     return state, steps
+
+
+def _walk_in_step(pyramid, r, state, steps, max_steps):
+    """All rays step until the last of them is done."""
+
+    def goes_on(carry):
+        state, steps = carry
+        return jnp.any(_alive(state, steps, max_steps))
+
+    def body(carry):
+        state, steps = carry
+        for _ in range(_TURN):
+            live = _alive(state, steps, max_steps)
+            state = jnp.where(live, step(pyramid, r, state), state)
+            steps = steps + live.astype(jnp.int32)
+        return state, steps
+
+    return jax.lax.while_loop(goes_on, body, (state, steps))
 
 
 def _alive(state: Array, steps: Array, max_steps: int) -> Bool[Array, " ray"]:

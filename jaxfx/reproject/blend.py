@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
+from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.camera._rigid import per_depth
@@ -205,7 +206,8 @@ def _over_sources(function: Callable, *lists: Sequence) -> Any:
     stack = lambda *leaves: jnp.stack(leaves)
     if len(kinds) == 1:
         stacked = tuple(jax.tree.map(stack, *items) for items in lists)
-        return jax.lax.map(lambda each: function(*each), stacked)
+        in_turn = lambda *each: jax.lax.map(lambda one: function(*one), each)
+        return by_platform(*stacked, cpu=in_turn, accelerator=jax.vmap(function))
     results = [function(*each) for each in zip(*lists, strict=True)]
     return jax.tree.map(stack, *results)
 

@@ -1,20 +1,24 @@
-"""A filter's work in some pixels of many, and the derivatives of those alone."""
+"""A filter's work in some pixels of many, and the derivatives of those alone.
+
+A CPU collects these pixels and filters no others. An accelerator filters every pixel and
+selects: there the filter is one launch, and to collect pixels takes hundreds.
+"""
 
 import functools as ft
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import sequential_vmap
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._linear import linear
+from jaxfx._platform import by_platform, one_by_one_on_cpu
 from jaxfx.shadow import _taps
 from jaxfx.shadow._compact import fold
 from jaxfx.shadow._taps import Places
 from jaxfx.shadow._windows import extremes, unions
-from jaxfx.shadow.pcf import average
+from jaxfx.shadow.pcf import average, filtered
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -49,31 +53,44 @@ def _near_edges(
     return unions(padded, 2 * dilation + 1) == lit | dark
 
 
-# A loop that ends with its data would go on to the slowest of a batch: hence one by one.
-
-
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2, 3))
 def masked(size, kernel, mask, dilation, *data):
     """`pcf` of checked arguments in the pixels of the mask, the comparison in the others."""
+    options = (size, kernel, mask, dilation)
 
-    @sequential_vmap
-    def run(shadow_map, receivers, bias, slope_bias, softness):
-        data = (shadow_map, receivers, bias, slope_bias, softness)
-        texels, where, value = find_mask(size, mask, dilation, *data)
-        flat = jax.tree.map(jnp.ravel, receivers)
-
-        def fetch(pixels):
-            chunk = Receivers(*(each[pixels] for each in flat))
-            shape, dtype = shadow_map.shape, texels.dtype
-            return _taps.find_places(chunk, bias, slope_bias, shape, size, dtype)
-
-        def step(value, pixels, places: Any):
-            return _put(value, pixels, average(texels, places, softness, size, kernel))
-
-        result = fold(where.reshape(-1), value.reshape(-1), fetch, step)
-        return result.reshape(where.shape).astype(receivers.z.dtype)
+    @one_by_one_on_cpu
+    def run(*data):
+        some, every = ft.partial(_some, *options), ft.partial(_every, *options)
+        return by_platform(*data, cpu=some, accelerator=every)
 
     return run(*data)
+
+
+def _some(size, kernel, mask, dilation, shadow_map, receivers, bias, slope_bias, softness):
+    """`masked`, by the filter in the pixels of the mask alone."""
+    data = (shadow_map, receivers, bias, slope_bias, softness)
+    texels, where, value = find_mask(size, mask, dilation, *data)
+    flat = jax.tree.map(jnp.ravel, receivers)
+
+    def fetch(pixels):
+        chunk = Receivers(*(each[pixels] for each in flat))
+        shape, dtype = shadow_map.shape, texels.dtype
+        return _taps.find_places(chunk, bias, slope_bias, shape, size, dtype)
+
+    def step(value, pixels, places: Any):
+        return _put(value, pixels, average(texels, places, softness, size, kernel))
+
+    result = fold(where.reshape(-1), value.reshape(-1), fetch, step)
+    return result.reshape(where.shape).astype(receivers.z.dtype)
+
+
+def _every(size, kernel, mask, dilation, *data):
+    """`masked`, by the filter in every pixel. Outside of the mask by depth its values agree."""
+    value = filtered(*data, size, kernel)
+    if mask == "depth":
+        return value
+    _, where, hard = find_mask(size, mask, dilation, *data)
+    return jnp.where(where, value, hard.astype(value.dtype))
 
 
 def _masked_jvp(size, kernel, mask, dilation, primals, tangents):
@@ -102,15 +119,15 @@ def _masked_jvp(size, kernel, mask, dilation, primals, tangents):
         (texels_dot, floats_dot, softness_dot),
     )
     moves = tuple(dot is not None for dot in dots)
-    push, pull = (
-        sequential_vmap(ft.partial(each, size, kernel, moves)) for each in (_push, _pull)
-    )
 
-    def plain(dots):
-        f, at = _average_of(size, kernel, moves, *fixed[1:])
-        return jnp.where(where, jax.jvp(f, (at,), (dots,))[1], 0)
+    def ways(some, every):
+        some, every = (ft.partial(each, size, kernel, moves) for each in (some, every))
+        chosen = lambda *data: by_platform(*data, cpu=some, accelerator=every)
+        return ft.partial(one_by_one_on_cpu(chosen), *fixed)
 
-    out = linear(ft.partial(push, *fixed), ft.partial(pull, *fixed), plain, dots)
+    push, pull = ways(_push, _push_every), ways(_pull, _pull_every)
+    plain = ft.partial(_push_every, size, kernel, moves, *fixed)
+    out = linear(push, pull, plain, dots)
     value = masked(size, kernel, mask, dilation, *primals)
     return value, out.astype(value.dtype)
 
@@ -170,6 +187,18 @@ def _pull(size, kernel, moves, where, index, at, bar):
     flat_zeros = zeros[0], jax.tree.map(jnp.ravel, zeros[1]), zeros[2]
     texels, floats, softness = fold(where.reshape(-1), flat_zeros, _fetch(flat), step)
     return texels, jax.tree.map(lambda image: image.reshape(where.shape), floats), softness
+
+
+def _push_every(size, kernel, moves, where, index, at, dots):
+    """`_push` by the tangent in every pixel."""
+    f, here = _average_of(size, kernel, moves, index, at)
+    return jnp.where(where, jax.jvp(f, (here,), (dots,))[1], 0)
+
+
+def _pull_every(size, kernel, moves, where, index, at, bar):
+    """The transpose of `_push_every`."""
+    f, here = _average_of(size, kernel, moves, index, at)
+    return jax.vjp(f, here)[1](jnp.where(where, bar, 0))[0]
 
 
 def _fetch(flat):

@@ -66,14 +66,16 @@ def edge_pcf(
       of four edge pixels. Where light grazes a surface it covers more, without limit.
 
     **Returns:** height width, in [0, 1], in the type of the receivers. Any number of pixels
-    may need the filter; where none does, none is filtered. Batches are done one by one.
+    may need the filter; where none does, none is filtered. That is so on a CPU, where batches
+    are done one by one. On an accelerator every pixel is filtered, which is quicker there, and
+    the mask selects.
 
     **Raises:** `ValueError` as `pcf` does, for an unknown mask, a dilation that is not 1 or
     more, one with `mask="depth"`, or none with `mask="screen"` under a transform.
 
-    **Gradient:** `pcf`'s in the pixels that are filtered, at the cost of these; zero in the
-    others: exact with `mask="depth"`, missing with `"screen"` where that misses. The mask is
-    constant. Second derivatives cost a full filter.
+    **Gradient:** `pcf`'s in the pixels that are filtered, on a CPU at the cost of these; zero
+    in the others: exact with `mask="depth"`, missing with `"screen"` where that misses. The
+    mask is constant. Second derivatives cost a full filter.
 
     Source: Yu & Choi, an improved PCF technique for the generation of shadows, section 4;
     earlier, Uralsky 2005 (GPU Gems 2, chapter 17) and Evans et al. filter edges alone. Our

@@ -1,0 +1,65 @@
+"""Depth of field whose accelerators' programs differ: both are held to the same oracles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfx import ThinLens, dof
+from jaxfx.dof import diffusion
+from jaxfx.dof.separable import _along_rows
+from tests.dof.test_diffusion import (  # noqa: F401
+    test_a_point_of_light_has_the_variance_of_its_disc,
+    test_energy_is_kept_and_nothing_rings,
+    test_implicit_is_two_dense_solves,
+    test_implicit_keeps_its_digits_at_any_radius,
+    test_nothing_flows_into_focus_or_past_a_bad_pixel,
+)
+from tests.dof.test_separable import (  # noqa: F401
+    test_a_bad_pixel_spoils_its_square,
+    test_a_point_of_light_has_the_variance_of_its_disc as test_a_point_keeps_its_variance,
+    test_equals_the_loop,
+)
+from tests.helpers.quick import check_slopes
+
+
+@pytest.mark.parametrize("method", [dof.implicit_diffusion, dof.separable])
+def test_derivatives_are_difference_quotients(method):
+    rng = np.random.default_rng(3)
+    image, depth = rng.random((5, 6, 2)), rng.uniform(1.5, 9, (5, 6))
+
+    def total(image, depth, aperture):
+        lens = ThinLens(aperture, 3.0, 60.0)
+        return method(image, depth, lens, max_coc=9.0)
+
+    arguments = tuple(map(jnp.asarray, (image, depth, 0.2)))
+    check_slopes(total, arguments, eps=1e-6, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8, 13])
+@pytest.mark.parametrize("scale", [0.0, 1.0, 1e8])
+def test_both_eliminations_solve_the_dense_system(size, scale):
+    """At any number of unknowns and any conductance, each to its own rounding."""
+    rng = np.random.default_rng(size)
+    conductance = scale * rng.random((size - 1, 1, 2))
+    heat = rng.random((size, 3, 2))
+    for solve in (diffusion._cyclic_reduction, diffusion._thomas):
+        found = solve(jnp.asarray(conductance), jnp.asarray(heat))
+        for lane in range(2):
+            difference = np.diff(np.eye(size), axis=0)
+            matrix = difference.T @ (conductance[:, 0, lane, None] * difference)
+            expected = np.linalg.solve(np.eye(size) + matrix, heat[..., lane])
+            # The dense system is as bad as its conductance is large; ours is not.
+            np.testing.assert_allclose(found[..., lane], expected, rtol=1e-13 + 1e-16 * scale)
+
+
+@pytest.mark.parametrize("together", [1, 2, 6, 40])
+def test_any_number_of_taps_together_gives_the_same_pass(together):
+    rng = np.random.default_rng(0)
+    coc = rng.uniform(0, 7, (4, 9))
+    planes = rng.random((3, 4, 9)), coc / 2 + 0.5, coc, coc, (coc > 1).astype(float)
+    planes, epsilon = tuple(map(jnp.asarray, planes)), jnp.asarray(2.0)
+    pass_of = lambda together: jax.jit(_along_rows, static_argnums=(2, 3))(
+        planes, epsilon, 5, together
+    )
+    np.testing.assert_allclose(pass_of(together), pass_of(1), rtol=1e-13)
