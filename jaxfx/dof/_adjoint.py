@@ -41,9 +41,11 @@ def with_adjoint(
 
     On a CPU a batch is worked through one by one, so that it costs what its members do.
     """
-    def mapped(cpu, elsewhere):
+    def mapped(*programs):
+        # Compiled, so that they are traced once, however often a transform comes back to them.
+        programs = [jax.jit(each, static_argnums=0) for each in dict.fromkeys(programs)]
+
         def call(reach, *operands):
-            programs = (cpu,) if cpu is elsewhere else (cpu, elsewhere)
             return one_by_one_on_cpu(*(ft.partial(each, reach) for each in programs))(*operands)
 
         return call
