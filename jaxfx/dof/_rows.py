@@ -23,9 +23,9 @@ from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
 from jaxfx.dof._taps import Sweep, inside
 
 
-# The most that one kernel takes, in taps times planes that are read: more are long to compile. And
-# in that times sums: given more, XLA keeps what several sums share in memory, for every tap.
-_READS, _COST = 500, 2300
+# The most that one kernel takes, in taps times planes that are read; and in that times sums. Given
+# more, XLA keeps what several sums share in memory, for every tap.
+_READS, _COST = 580, 2300
 
 
 def _sums(
@@ -49,7 +49,7 @@ def _sums(
     reads, added = (len(jax.tree.leaves(x)) for x in ((covers, own, other), sums))
     most = max(1, min(_READS // reads, _COST // (reads * added)))
     run = -(-taps // -(-taps // most))  # taps at a time, of equal runs
-    rows = max(1, min(taps, most // taps))  # at a time
+    rows = max(1, min(taps, most // (2 * taps)))  # at a time; more are long to compile
     turns = -(-taps // rows)
 
     def padded(plane, fill=0.0):

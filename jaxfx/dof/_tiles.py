@@ -21,8 +21,10 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
+from jaxfx._platform import by_platform
 from jaxfx.dof import _taps
 from jaxfx.dof._adjoint import Program, with_adjoint
+from jaxfx.dof._rows import ROWS
 from jaxfx.dof._shift import shift
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, segment_integral
 from jaxfx.dof._taps import Planes, Sweep, clip, inside, stacked, to_planes
@@ -47,11 +49,13 @@ def tiles(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
 def sum_all(
     value: Float[Array, "height width value"], radius: Float[Array, "height width"], reach: int
 ) -> Float[Array, "height width value"]:
-    """The sums over all sprites, whatever hides or rejects them, by the quicker kernel."""
+    """The sums over all sprites, whatever hides or rejects them, by the quicker program."""
     zero, one = jnp.zeros_like(radius), jnp.ones((), radius.dtype)
     sprites = Sprites(value, radius, zero - 1, zero, one)
-    is_small = radius.size * (2 * reach + 1) ** 2 < _FEW_TAPS
-    return (shift if is_small else tiles)(sprites, reach)
+    if radius.size * (2 * reach + 1) ** 2 >= _FEW_TAPS:
+        return jnp.moveaxis(_all(reach, to_planes(sprites)), 0, -1)
+    by_rows = lambda sprites: jnp.moveaxis(_by_rows(reach, to_planes(sprites)), 0, -1)
+    return by_platform(sprites, cpu=lambda sprites: shift(sprites, reach), accelerator=by_rows)
 
 
 def plain(reach: int, planes: Planes) -> Float[Array, "value height width"]:
@@ -235,3 +239,5 @@ forward, tangent, adjoint = (ft.partial(each, Sweep(_sweep, clip)) for each in _
 TILES = Program(forward, tangent, adjoint)
 SHIFTS = Program(plain, tangent, adjoint)  # the derivatives of `shift` take longer
 _sums = with_adjoint(*TILES, plain)
+_all = with_adjoint(*TILES, plain, ROWS)
+_by_rows = with_adjoint(*ROWS, plain)
