@@ -68,7 +68,9 @@ def either(
 
         def each(*operands):
             # Not by a `cond`: what it closes over then has a batch axis too.
-            select = jax.vmap(lambda asked, *two: jax.tree.map(ft.partial(jnp.where, asked), *two))
+            select = jax.vmap(
+                lambda asked, *two: jax.tree.map(ft.partial(jnp.where, asked), *two)
+            )
             return select(asks(*operands), shorts(*operands), longs(*operands))
 
         at_once = lambda *operands: either(ask_all, shorts, each, *operands)

@@ -41,6 +41,7 @@ def with_adjoint(
 
     On a CPU a batch is worked through one by one, so that it costs what its members do.
     """
+
     def mapped(*programs):
         # Compiled, so that they are traced once, however often a transform comes back to them.
         programs = [jax.jit(each, static_argnums=0) for each in dict.fromkeys(programs)]

@@ -23,8 +23,8 @@ from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
 from jaxfx.dof._taps import Sweep, inside
 
 
-# The most that one kernel takes, in taps times planes that are read; and in that times sums. Given
-# more, XLA keeps what several sums share in memory, for every tap.
+# The most that one kernel takes, in taps times planes that are read; and in that times sums.
+# Given more, XLA keeps what several sums share in memory, for every tap.
 _READS, _COST = 580, 2300
 
 

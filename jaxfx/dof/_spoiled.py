@@ -48,7 +48,7 @@ def _grown(
 ) -> Bool[Array, "height width"]:
     """The same in few launches: every row of every sprite at once, by doubling steps aside.
 
-    `beyond` is to how many columns beyond a pixel the row goes on, -1 where there is none of it.
+    `beyond` is how many columns beyond its pixel a row goes on, -1 where there is none of it.
     """
     height, width = bad.shape
     rows = jnp.arange(far + 1).astype(radius.dtype)  # a sprite is its own mirror image

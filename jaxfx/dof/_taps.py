@@ -14,12 +14,13 @@ from jaxfx.dof._sprites import Sprites
 class Sweep(NamedTuple):
     """A program that visits all taps.
 
-    `sums(tap, reach, radius, own, other, *, by_source, slopes)` gives, for every pixel, the sums
-    of `tap(cover, slope, own, other)` over the offsets about it, a list of planes or of stacks.
-    `own` are the planes at the pixel and `other` those at the offset, one or a stack of them;
-    what its compiler does better with may be handed to `tap` as a list of planes. The sprite is
-    the pixel's own where `by_source`, else the other's; `cover` is its coverage at the offset
-    and `slope`, given where `slopes` are asked for, that coverage's derivative in its radius.
+    `sums(tap, reach, radius, own, other, *, by_source, slopes)` gives, for every pixel, what
+    `tap(cover, slope, own, other)` sums to over the offsets about it: a list of planes or of
+    stacks. `own` are the planes at the pixel and `other` those at the offset, one or a stack of
+    them, which may be handed to `tap` as a list of planes where that compiles better. The
+    sprite is the pixel's own where `by_source`, else the other's; `cover` is its coverage at
+    the offset and `slope`, given where `slopes` are asked for, that coverage's derivative in its
+    radius.
 
     `clip` clamps to [0, 1], in the way that its compiler likes.
     """

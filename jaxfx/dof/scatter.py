@@ -160,7 +160,9 @@ def to_sprites(
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8))
-def _in_or_out_of_focus(image, depth, lens, gamma, epsilon, missing, max_coc, kernels, coverage):
+def _in_or_out_of_focus(
+    image, depth, lens, gamma, epsilon, missing, max_coc, kernels, coverage
+):
     """A picture wholly in focus is itself; its derivative is computed like any other."""
     blurred = ft.partial(_blurred, max_coc=max_coc, kernels=kernels, coverage=coverage)
 
