@@ -165,9 +165,8 @@ class Misfit(eqx.Module):
     def __call__(self, unknowns: dict[str, Any]) -> Float[Array, "height width channel"]:
         values = dict(unknowns)
         lens = ThinLens(values.pop("aperture"), values.pop("focus_distance"), 16 / 0.375)
-        return (
-            dof.scatter(self.image, self.depth, lens, max_coc=16.0, **values) - self.reference
-        )
+        picture = dof.scatter(self.image, self.depth, lens, max_coc=16.0, **values)
+        return (picture - self.reference).astype(float)  # as `fit.dof` has it
 
 
 def fitting(side):

@@ -19,7 +19,7 @@ class Sweep(NamedTuple):
     stacks. `own` are the planes at the pixel and `other` those at the offset, one or a stack of
     them, which may be handed to `tap` as a list of planes where that compiles better. The
     sprite is the pixel's own where `by_source`, else the other's; `cover` is its coverage at
-    the offset and `slope`, given where `slopes` are asked for, that coverage's derivative in its
+    the offset and `slope`, given where `slopes` are asked for, the derivative of that in its
     radius.
 
     `clip` clamps to [0, 1], in the way that its compiler likes.
