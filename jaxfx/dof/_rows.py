@@ -118,4 +118,8 @@ def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 
 _SWEEP = Sweep(_sums, _clip)
-ROWS = Program(*(ft.partial(each, _SWEEP) for each in _taps.PARTS))
+ROWS = Program(
+    ft.partial(_taps.forward, _SWEEP),
+    ft.partial(_taps.tangent, _SWEEP),
+    ft.partial(_taps.adjoint, _SWEEP),
+)

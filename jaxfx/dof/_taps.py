@@ -139,6 +139,3 @@ def clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def inside(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The derivative of `clip`, at its kinks the one from above."""
     return ((x >= 0) & (x < 1)).astype(x.dtype)
-
-
-PARTS = forward, tangent, adjoint

@@ -235,7 +235,10 @@ def _tile_reaches(
     return reach.reshape(-1)
 
 
-forward, tangent, adjoint = (ft.partial(each, Sweep(_sweep, clip)) for each in _taps.PARTS)
+_SWEEP = Sweep(_sweep, clip)
+forward = ft.partial(_taps.forward, _SWEEP)
+tangent = ft.partial(_taps.tangent, _SWEEP)
+adjoint = ft.partial(_taps.adjoint, _SWEEP)
 TILES = Program(forward, tangent, adjoint)
 SHIFTS = Program(plain, tangent, adjoint)  # the derivatives of `shift` take longer
 _sums = with_adjoint(*TILES, plain)

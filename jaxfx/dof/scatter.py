@@ -28,7 +28,8 @@ Coverage = Literal["area", "indicator"]
 
 _PROGRAMS = {"shift": SHIFTS, "tiles": TILES, "spans": SPANS, "rows": ROWS}
 
-# For `cheapest`: seconds, and nanoseconds a pixel, a pixel's row, a tap that is computed.
+# For `cheapest`: seconds, and nanoseconds a pixel, a pixel's row, a tap that is computed, as
+# measured on two cores.
 _SECONDS: dict[Any, tuple[float, float, float, float]] = {
     "shift": (0.0, 40.0, 0.0, 1.5),
     "tiles": (0.01, 20.0, 0.0, 0.5),
@@ -77,8 +78,10 @@ def scatter(
       out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an
       offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
       `"spans"` paints large sprites row by row with running sums, at a cost that grows with the
-      radius, not its square. `"auto"` is the cheapest of the last three by a model of their
-      time: outside of transforms for the largest circle in the data, else for `max_coc`.
+      radius, not its square, `"rows"` adds all offsets of a row at once over the whole picture.
+      `"auto"` is `"rows"` where the program is compiled for an accelerator; on a CPU it is the
+      cheapest of the three before it by a model of their time, outside of transforms for the
+      largest circle in the data, else for `max_coc`.
     - `coverage`: `"area"`, the exact area of the disc in each row of pixels, or `"indicator"`,
       the paper's own, 1 where a pixel's centre lies inside (`"segment_sum"` only).
 
@@ -214,7 +217,7 @@ def _quotient_jvp(primals, tangents):
 
 
 def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
-    """The kernel that takes least for a picture whose every sprite is the largest.
+    """The kernel that takes a CPU least for a picture whose every sprite is the largest.
 
     Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows * columns)`, with
     `2 * reach + 1` rows and, in tiles, as many columns as their runs of taps come to; the
