@@ -1,11 +1,14 @@
 """Which program runs where, and how a batch is taken."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from jaxfx._platform import by_platform, one_by_one_on_cpu
+from jaxfx._platform import by_platform, either, one_by_one_on_cpu
+from tests.helpers.programs import for_accelerators
 
 
 def _lowered(function, *operands, platform):
@@ -40,3 +43,32 @@ def test_a_batch_goes_one_by_one_on_a_cpu_and_at_once_elsewhere():
     for platform in ("cpu", "cuda"):
         text = _lowered(mapped, x, pair, platform=platform)
         assert ("stablehlo.while" in text) == (platform == "cpu"), text
+
+
+def test_two_programs_take_a_batch_each_in_its_way():
+    both = one_by_one_on_cpu(jnp.sin, jnp.cos)
+    x = jnp.arange(3.0)
+    np.testing.assert_allclose(jax.jit(both)(x), np.sin(x))
+    np.testing.assert_allclose(jax.jit(jax.vmap(both))(x), np.sin(x))
+    for platform, name, other in (("cpu", "sine", "cosine"), ("cuda", "cosine", "sine")):
+        for f in (both, jax.vmap(both), jax.vmap(jax.vmap(both, 0), None, axis_size=2)):
+            text = _lowered(f, x, platform=platform)
+            assert f"stablehlo.{name} " in text and f"stablehlo.{other} " not in text
+
+
+def test_either_computes_one_of_two():
+    is_small, small, large = lambda x, _: x.sum() < 3, lambda x, by: x, lambda x, by: by * x
+    call = lambda x, by: either(is_small, small, large, x, by)
+    x, by = jnp.asarray([[0.0, 1.0], [2.0, 3.0]]), jnp.asarray([5.0, 7.0])
+    expected = np.array([[0, 1], [10, 15]])
+    batch, nested = jax.vmap(call, (0, None)), jax.vmap(jax.vmap(call, (0, None)), (None, 0))
+    for wrap in (contextlib.nullcontext, for_accelerators):
+        with wrap():
+            np.testing.assert_allclose(jax.jit(batch)(x, by[0]), expected)
+            np.testing.assert_allclose(jax.jit(nested)(x, by)[1], [[0, 1], [14, 21]])
+            np.testing.assert_allclose([call(each, by[0]) for each in x], expected)
+    # A CPU looks at each member, an accelerator once at all of them.
+    for platform in ("cpu", "cuda"):
+        text = _lowered(batch, x, by[0], platform=platform)
+        assert ("stablehlo.while" in text) == (platform == "cpu")
+        assert "stablehlo.case" in text

@@ -2,16 +2,24 @@
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
-from jax.custom_batching import sequential_vmap
 from jaxtyping import Array
 
 from jaxfx._linear import linear
+from jaxfx._platform import one_by_one_on_cpu
 
 
 Planes = TypeVar("Planes", bound=Any)
+
+
+class Program(NamedTuple):
+    """One way to compute a kernel, of the number of pixels that sprites reach and of planes."""
+
+    forward: Callable[[int, Any], Array]
+    tangent: Callable[[int, Any, Any], Array]
+    adjoint: Callable[[int, Any, Array], Any]
 
 
 def with_adjoint(
@@ -19,6 +27,7 @@ def with_adjoint(
     tangent: Callable[[int, Planes, Planes], Array],
     adjoint: Callable[[int, Planes, Array], Planes],
     plain: Callable[[int, Planes], Array],
+    accelerator: Program | None = None,
 ) -> Callable[[int, Planes], Array]:
     """`forward(reach, planes)`, to be mapped and differentiated, in both modes and again.
 
@@ -27,24 +36,37 @@ def with_adjoint(
     - `adjoint(reach, planes, bar)`: the transpose of that.
     - `plain(reach, planes)`: the same function as JAX itself can differentiate it. Second
       derivatives take theirs from it.
+    - `accelerator`: the first three where the program is lowered for something else than a CPU;
+      the same if it is left out.
 
-    A batch is worked through one by one, so that it costs what its members do.
+    On a CPU a batch is worked through one by one, so that it costs what its members do.
     """
+
+    def mapped(*programs):
+        # Compiled, so that they are traced once, however often a transform comes back to them.
+        programs = [jax.jit(each, static_argnums=0) for each in dict.fromkeys(programs)]
+
+        def call(reach, *operands):
+            return one_by_one_on_cpu(*(ft.partial(each, reach) for each in programs))(*operands)
+
+        return call
+
+    cpu = forward, tangent, adjoint
+    forward, tangent, adjoint = map(mapped, cpu, accelerator or cpu)
 
     @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
     def kernel(reach: int, planes: Planes) -> Array:
-        return sequential_vmap(ft.partial(forward, reach))(planes)
+        return forward(reach, planes)
 
     @kernel.defjvp
     def _(reach: int, primals: Any, tangents: Any) -> tuple[Array, Array]:
         (planes,), (dot,) = primals, tangents
-        push = sequential_vmap(ft.partial(tangent, reach))
-        pull = sequential_vmap(ft.partial(adjoint, reach))
+        push = ft.partial(tangent, reach, planes)
+        pull = ft.partial(adjoint, reach, planes)
 
         def derivative(dot):
             return jax.jvp(ft.partial(plain, reach), (planes,), (dot,))[1]
 
-        out = linear(ft.partial(push, planes), ft.partial(pull, planes), derivative, dot)
-        return kernel(reach, planes), out
+        return kernel(reach, planes), linear(push, pull, derivative, dot)
 
     return kernel

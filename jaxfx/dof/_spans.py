@@ -18,10 +18,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof import _tiles
-from jaxfx.dof._adjoint import with_adjoint
+from jaxfx.dof._adjoint import Program, with_adjoint
 from jaxfx.dof._paint import paint, read_back
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites
-from jaxfx.dof._tiles import Planes
+from jaxfx.dof._taps import Planes, inside, to_planes
 
 
 # From this many epsilons on, the leak rejection no longer depends on the source.
@@ -32,7 +32,7 @@ _HIGHLIGHT = 16.0
 
 def spans(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
     """The sums over all sprites that reach at most `reach` pixels along an axis."""
-    return jnp.moveaxis(_sums(reach, _tiles.to_planes(sprites)), 0, -1)
+    return jnp.moveaxis(_sums(reach, to_planes(sprites)), 0, -1)
 
 
 def _parts(
@@ -73,7 +73,7 @@ def _tangent(reach: int, planes: Planes, dot: Planes) -> Float[Array, "value hei
     value, blurred = planes.value, clip01(planes.coc - 1)
     dots = dot.value, dot.radius
     sums = blurred[None] * paint(reach, value, behind, dots)
-    blurred_dot = _tiles.inside(planes.coc - 1) * dot.coc
+    blurred_dot = inside(planes.coc - 1) * dot.coc
     sums = sums + blurred_dot[None] * paint(reach, value, behind)
     sums = sums + paint(reach, value, before, dots)
     near_dot = dot._replace(
@@ -94,8 +94,9 @@ def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]
     )
     bars = read_back(reach, value, before, bar, bars)
     bars = read_back(reach, value, behind, bar, bars, blurred)
-    coc_bar = near_bar.coc + _tiles.inside(planes.coc - 1) * blurred_bar
+    coc_bar = near_bar.coc + inside(planes.coc - 1) * blurred_bar
     return Planes(*bars, near_bar.leak, coc_bar)
 
 
-_sums = with_adjoint(_forward, _tangent, _adjoint, _tiles.plain)
+SPANS = Program(_forward, _tangent, _adjoint)
+_sums = with_adjoint(*SPANS, _tiles.plain)

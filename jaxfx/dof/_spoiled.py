@@ -1,11 +1,13 @@
 """Pixels that a colour which is no number spoils: all that its sprite reaches."""
 
+import functools as ft
+
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float
 
-from jaxfx.dof._sprites import POINT_RADIUS, reach
+from jaxfx._platform import by_platform, either
+from jaxfx.dof._sprites import POINT_RADIUS, reach, row_half_width
 from jaxfx.dof._tiles import sum_all
 
 
@@ -20,13 +22,44 @@ def spoiled(
     # The other pixels reach only themselves: the kernels then skip them.
     radius = jax.lax.stop_gradient(jnp.where(bad, diameter / 2, POINT_RADIUS))
 
-    # One by one: under `vmap` a `cond` by itself becomes a `select`, and computes both sides.
-    @sequential_vmap
-    def reached(bad, radius):
-        return jax.lax.cond(bad.any(), cover, lambda bad, _: bad, bad, radius)
+    # Not by a `cond` alone, which under `vmap` becomes a `select`, and computes both sides.
+    is_good = lambda bad, _: ~bad.any()
+    found = ft.partial(_reached, reach(max_coc))
+    return either(is_good, lambda bad, _: bad, found, bad, radius)
 
-    def cover(bad, radius):
-        value = bad[..., None].astype(radius.dtype)
-        return sum_all(value, radius, reach(max_coc))[..., 0] > 0
 
-    return reached(bad, radius)
+def _reached(
+    far: int, bad: Bool[Array, "height width"], radius: Float[Array, "height width"]
+) -> Bool[Array, "height width"]:
+    return by_platform(
+        bad, radius, cpu=ft.partial(_summed, far), accelerator=ft.partial(_grown, far)
+    )
+
+
+def _summed(
+    far: int, bad: Bool[Array, "height width"], radius: Float[Array, "height width"]
+) -> Bool[Array, "height width"]:
+    """Where the sum of their sprites is not 0."""
+    return sum_all(bad[..., None].astype(radius.dtype), radius, far)[..., 0] > 0
+
+
+def _grown(
+    far: int, bad: Bool[Array, "height width"], radius: Float[Array, "height width"]
+) -> Bool[Array, "height width"]:
+    """The same in few launches: every row of every sprite at once, by doubling steps aside.
+
+    `beyond` is how many columns beyond its pixel a row goes on, -1 where there is none of it.
+    """
+    height, width = bad.shape
+    rows = jnp.arange(far + 1).astype(radius.dtype)  # a sprite is its own mirror image
+    half = jax.vmap(row_half_width, (None, 0))(radius, rows)
+    beyond = jnp.where(bad[None] & (half > 0), jnp.ceil(half + 0.5) - 1, -1).astype(jnp.int16)
+    step = 1
+    while step <= far:
+        wide = jnp.pad(beyond, ((0, 0), (0, 0), (step, step)), constant_values=-1)
+        beside = jnp.maximum(wide[..., :width], wide[..., 2 * step :])
+        beyond, step = jnp.maximum(beyond, beside - step), 2 * step
+    tall = jnp.pad(beyond, ((0, 0), (far, far), (0, 0)), constant_values=-1)
+    offsets = [(abs(row), row + far) for row in range(-far, far + 1)]
+    found = [tall[row, start : start + height] for row, start in offsets]
+    return ft.reduce(jnp.maximum, found) >= 0

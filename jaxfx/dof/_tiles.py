@@ -13,7 +13,7 @@ with the square of the radius.
 import functools as ft
 from collections.abc import Callable
 from itertools import count, takewhile
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +21,13 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
-from jaxfx._numerics import clip01
-from jaxfx.dof._adjoint import with_adjoint
+from jaxfx._platform import by_platform
+from jaxfx.dof import _taps
+from jaxfx.dof._adjoint import Program, with_adjoint
+from jaxfx.dof._rows import ROWS
 from jaxfx.dof._shift import shift
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, segment_integral
+from jaxfx.dof._taps import Planes, Sweep, clip, inside, stacked, to_planes
 
 
 # Tall enough to spread a row's overhead, wide for the vector units, small enough for the cache.
@@ -38,132 +41,28 @@ RUN, NEAR = 17, 8
 _FEW_TAPS = 2**20
 
 
-class Planes(NamedTuple):
-    """Sprites as the kernel reads them, with `leak` and `coc` in units of epsilon."""
-
-    value: Float[Array, "value height width"]
-    radius: Float[Array, "height width"]
-    leak: Float[Array, "height width"]
-    coc: Float[Array, "height width"]
-
-
 def tiles(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
     """The sums over all sprites that reach at most `reach` pixels along an axis."""
     return jnp.moveaxis(_sums(reach, to_planes(sprites)), 0, -1)
 
 
-def shifts(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
-    """The sums by `shift`, with the derivatives of `tiles`, which are quicker than its own."""
-    return jnp.moveaxis(_shifted(reach, to_planes(sprites)), 0, -1)
-
-
 def sum_all(
     value: Float[Array, "height width value"], radius: Float[Array, "height width"], reach: int
 ) -> Float[Array, "height width value"]:
-    """The sums over all sprites, whatever hides or rejects them, by the quicker kernel."""
+    """The sums over all sprites, whatever hides or rejects them, by the quicker program."""
     zero, one = jnp.zeros_like(radius), jnp.ones((), radius.dtype)
     sprites = Sprites(value, radius, zero - 1, zero, one)
-    is_small = radius.size * (2 * reach + 1) ** 2 < _FEW_TAPS
-    return (shift if is_small else tiles)(sprites, reach)
-
-
-def to_planes(sprites: Sprites) -> Planes:
-    """The sprites as the kernel reads them."""
-    value, radius, leak, coc, epsilon = sprites
-    return Planes(_stacked(value), radius, leak / epsilon, coc / epsilon)
-
-
-def _stacked(value: Float[Array, "height width value"]) -> Float[Array, "value height width"]:
-    return jnp.moveaxis(value, -1, 0)
-
-
-def forward(reach: int, planes: Planes) -> Float[Array, "value height width"]:
-    """The sums themselves."""
-    value, radius, leak, coc = planes
-
-    def tap(cover, own, other):
-        coc, sharp = own
-        value, leak = other
-        weight = cover * (1 - sharp * _clip(leak - coc))
-        return [weight[None] * value]
-
-    own, other = [coc, 1 - clip01(coc - 1)], [value, leak]
-    (sums,) = _sweep(tap, reach, radius, own, other, by_source=False, slopes=False)
-    return sums
-
-
-def tangent(reach: int, planes: Planes, dot: Planes) -> Float[Array, "value height width"]:
-    """Their derivative along `dot`."""
-    value, radius, leak, coc = planes
-
-    def tap(cover, slope, own, other):
-        coc, coc_dot, sharp, blurring = own
-        value, value_dot, leak, leak_dot, radius_dot = other
-        rise = leak - coc
-        weight = 1 - sharp * _clip(rise)
-        weight_dot = sharp * inside(rise) * (coc_dot - leak_dot)
-        weight_dot = weight_dot + blurring * coc_dot * _clip(rise)
-        product_dot = slope * radius_dot * weight + cover * weight_dot
-        return [product_dot[None] * value + (cover * weight)[None] * value_dot]
-
-    own = [coc, dot.coc, 1 - clip01(coc - 1), inside(coc - 1)]
-    other = [value, dot.value, leak, dot.leak, dot.radius]
-    (sums,) = _sweep(tap, reach, radius, own, other, by_source=False, slopes=True)
-    return sums
-
-
-def adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]) -> Planes:
-    """The transpose of `tangent`: one sweep owned by the sources, one by the destinations."""
-    value, radius, leak, coc = planes
-    sharp, blurring = 1 - clip01(coc - 1), inside(coc - 1)
-
-    def to_source(cover, slope, own, other):
-        value, leak = own
-        bar, coc, sharp = other
-        rise = leak - coc
-        weight = 1 - sharp * _clip(rise)
-        product = sum(x * y for x, y in zip(value, bar, strict=True))
-        leak_bar = -cover * sharp * inside(rise) * product
-        return [(cover * weight)[None] * bar, slope * weight * product, leak_bar]
-
-    def to_destination(cover, own, other):
-        bar, coc, sharp, blurring = own
-        value, leak = other
-        rise = leak - coc
-        product = sum(x * y for x, y in zip(value, bar, strict=True))
-        return [cover * (sharp * inside(rise) + blurring * _clip(rise)) * product]
-
-    own, other = [value, leak], [bar, coc, sharp]
-    value_bar, radius_bar, leak_bar = _sweep(
-        to_source, reach, radius, own, other, by_source=True, slopes=True
-    )
-    own, other = [bar, coc, sharp, blurring], [value, leak]
-    (coc_bar,) = _sweep(
-        to_destination, reach, radius, own, other, by_source=False, slopes=False
-    )
-    return Planes(value_bar, radius_bar, leak_bar, coc_bar)
+    if radius.size * (2 * reach + 1) ** 2 >= _FEW_TAPS:
+        return jnp.moveaxis(_all(reach, to_planes(sprites)), 0, -1)
+    by_rows = lambda sprites: jnp.moveaxis(_by_rows(reach, to_planes(sprites)), 0, -1)
+    return by_platform(sprites, cpu=lambda sprites: shift(sprites, reach), accelerator=by_rows)
 
 
 def plain(reach: int, planes: Planes) -> Float[Array, "value height width"]:
     """The same sums by `shift`, which JAX can differentiate again."""
     value, radius, leak, coc = planes
     one = jnp.ones((), radius.dtype)
-    return _stacked(shift(Sprites(jnp.moveaxis(value, 0, -1), radius, leak, coc, one), reach))
-
-
-_sums = with_adjoint(forward, tangent, adjoint, plain)
-_shifted = with_adjoint(plain, tangent, adjoint, plain)
-
-
-def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Clamp to [0, 1], by comparisons that compile to one instruction each."""
-    x = jnp.where(x > 0, x, 0)
-    return jnp.where(x < 1, x, 1)
-
-
-def inside(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The derivative of `_clip`, at its kinks the one from above."""
-    return ((x >= 0) & (x < 1)).astype(x.dtype)
+    return stacked(shift(Sprites(jnp.moveaxis(value, 0, -1), radius, leak, coc, one), reach))
 
 
 def _sweep(
@@ -176,13 +75,7 @@ def _sweep(
     by_source: bool,
     slopes: bool,
 ) -> list[Array]:
-    """For every pixel, the sums of `tap(cover, slope, own, other)` over the offsets about it.
-
-    `own` are the planes at the pixel and `other` those at the offset, one or a stack of them.
-    The sprite is the pixel's own where `by_source`, else the other's; `cover` is its coverage
-    at the offset and `slope`, given where `slopes` are asked for, that coverage's derivative in
-    its radius. `tap` gives planes or stacks of them, and their sums come back.
-    """
+    """What a `Sweep` of `_taps` gives."""
     height, width = radius.shape
     tall, wide = min(TILE[0], -(-height // 8) * 8), min(TILE[1], -(-width // 8) * 8)
     rows, columns = -(-height // tall), -(-width // wide)
@@ -266,7 +159,7 @@ def _add_run(tap, mine, there, spans, sums, start, size, edge, *, by_source):
         at = slice(k, k + wide)
         width, *width_dot = spans if by_source else [x[:, at] for x in spans]
         passed, factor = edge(width, k)
-        covers = [_clip(passed), *(inside(passed) * factor * x for x in width_dot)]
+        covers = [clip(passed), *(inside(passed) * factor * x for x in width_dot)]
         taps = tap(*covers, mine, [x[..., at] for x in there])
         sums = [x + y for x, y in zip(sums, taps, strict=True)]
     return sums
@@ -340,3 +233,14 @@ def _tile_reaches(
         there = jnp.broadcast_to(reach, far.shape)
         reach = jnp.where(far <= there, there, 0).max(axis=(2, 3))
     return reach.reshape(-1)
+
+
+_SWEEP = Sweep(_sweep, clip)
+forward = ft.partial(_taps.forward, _SWEEP)
+tangent = ft.partial(_taps.tangent, _SWEEP)
+adjoint = ft.partial(_taps.adjoint, _SWEEP)
+TILES = Program(forward, tangent, adjoint)
+SHIFTS = Program(plain, tangent, adjoint)  # the derivatives of `shift` take longer
+_sums = with_adjoint(*TILES, plain)
+_all = with_adjoint(*TILES, plain, ROWS)
+_by_rows = with_adjoint(*ROWS, plain)

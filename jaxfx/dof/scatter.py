@@ -1,28 +1,35 @@
 """Depth of field by scattering every pixel over its circle of confusion."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import sequential_vmap
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._checks import Number, check, option, parameter
+from jaxfx._platform import either
+from jaxfx.dof._adjoint import with_adjoint
 from jaxfx.dof._inputs import check_arguments, largest_of, pixels, with_own
+from jaxfx.dof._rows import ROWS
 from jaxfx.dof._segment_sum import COVERAGES, segment_sum
-from jaxfx.dof._spans import spans
+from jaxfx.dof._spans import SPANS
 from jaxfx.dof._spoiled import spoiled
 from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
-from jaxfx.dof._tiles import farthest, shifts, tiles
+from jaxfx.dof._taps import Planes, to_planes
+from jaxfx.dof._tiles import SHIFTS, TILES, farthest, plain
 from jaxfx.lens import Lens
 
 
-Kernel = Literal["auto", "segment_sum", "shift", "tiles", "spans"]
+Kernel = Literal["auto", "segment_sum", "shift", "tiles", "spans", "rows"]
 Coverage = Literal["area", "indicator"]
 
-# For `cheapest`: seconds, and nanoseconds a pixel, a pixel's row, a tap that is computed.
+_PROGRAMS = {"shift": SHIFTS, "tiles": TILES, "spans": SPANS, "rows": ROWS}
+
+# For `cheapest`: seconds, and nanoseconds a pixel, a pixel's row, a tap that is computed, as
+# measured on two cores.
 _SECONDS: dict[Any, tuple[float, float, float, float]] = {
     "shift": (0.0, 40.0, 0.0, 1.5),
     "tiles": (0.01, 20.0, 0.0, 0.5),
@@ -71,8 +78,10 @@ def scatter(
       out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an
       offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
       `"spans"` paints large sprites row by row with running sums, at a cost that grows with the
-      radius, not its square. `"auto"` is the cheapest of the last three by a model of their
-      time: outside of transforms for the largest circle in the data, else for `max_coc`.
+      radius, not its square, `"rows"` adds all offsets of a row at once over the whole picture.
+      `"auto"` is `"rows"` where the program is compiled for an accelerator; on a CPU it is the
+      cheapest of the three before it by a model of their time, outside of transforms for the
+      largest circle in the data, else for `max_coc`.
     - `coverage`: `"area"`, the exact area of the disc in each row of pixels, or `"indicator"`,
       the paper's own, 1 where a pixel's centre lies inside (`"segment_sum"` only).
 
@@ -115,8 +124,10 @@ def scatter(
         largest = largest_of("scatter", depth, lens)
         room = max_coc if largest is None else min(max_coc, largest)
         height, width = depth.shape
-        kernel = cheapest(height, width, room)
-    return _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage)
+        kernels = cheapest(height, width, room), "rows"
+    else:
+        kernels = kernel, kernel
+    return _scatter(image, depth, lens, gamma, epsilon, max_coc, kernels, coverage)
 
 
 def to_sprites(
@@ -152,37 +163,42 @@ def to_sprites(
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8))
-def _in_or_out_of_focus(image, depth, lens, gamma, epsilon, missing, max_coc, kernel, coverage):
+def _in_or_out_of_focus(
+    image, depth, lens, gamma, epsilon, missing, max_coc, kernels, coverage
+):
     """A picture wholly in focus is itself; its derivative is computed like any other."""
-    blurred = ft.partial(_blurred, max_coc=max_coc, kernel=kernel, coverage=coverage)
+    blurred = ft.partial(_blurred, max_coc=max_coc, kernels=kernels, coverage=coverage)
 
-    # A batch is worked through one by one: each of its pictures may be sharp or not.
-    @sequential_vmap
-    def picture(image, depth, lens, gamma, epsilon, missing):
-        sharp = (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
-        operands = image, depth, lens, gamma, epsilon, missing
-        return jax.lax.cond(sharp, lambda image, *_: image, blurred, *operands)
+    def is_sharp(_, depth, lens, *__):
+        return (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
 
-    return picture(image, depth, lens, gamma, epsilon, missing)
+    operands = image, depth, lens, gamma, epsilon, missing
+    return either(is_sharp, lambda image, *_: image, blurred, *operands)
 
 
 @_in_or_out_of_focus.defjvp
-def _in_or_out_of_focus_jvp(max_coc, kernel, coverage, primals, tangents):
-    blurred = ft.partial(_blurred, max_coc=max_coc, kernel=kernel, coverage=coverage)
+def _in_or_out_of_focus_jvp(max_coc, kernels, coverage, primals, tangents):
+    blurred = ft.partial(_blurred, max_coc=max_coc, kernels=kernels, coverage=coverage)
     return jax.jvp(blurred, primals, tangents)
 
 
-def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, kernel, coverage):
+def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, kernels, coverage):
     """The quotient of the two sums, for finite pixels."""
     # Rematerialised: a reverse pass keeps the sprites, not the twenty planes they are made of.
     made = jax.checkpoint(to_sprites, static_argnums=5)
     sprites = made(image, depth, lens, gamma, epsilon, max_coc, missing)
-    if kernel == "segment_sum":
+    if "segment_sum" in kernels:
         sums = segment_sum(sprites, reach(max_coc), coverage)
     else:
-        kernels = {"shift": shifts, "tiles": tiles, "spans": spans}
-        sums = kernels[kernel](sprites, reach(max_coc))
+        planes = _kernel(*kernels)(reach(max_coc), to_planes(sprites))
+        sums = jnp.moveaxis(planes, 0, -1)
     return _quotient(with_own(sums, image, missing))
+
+
+@ft.cache
+def _kernel(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
+    """The sums by one kernel where the program is lowered for a CPU, by the other elsewhere."""
+    return with_adjoint(*_PROGRAMS[cpu], plain, _PROGRAMS[accelerator])
 
 
 @jax.custom_jvp
@@ -201,7 +217,7 @@ def _quotient_jvp(primals, tangents):
 
 
 def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
-    """The kernel that takes least for a picture whose every sprite is the largest.
+    """The kernel that takes a CPU least for a picture whose every sprite is the largest.
 
     Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows * columns)`, with
     `2 * reach + 1` rows and, in tiles, as many columns as their runs of taps come to; the
@@ -219,10 +235,10 @@ def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
     return min(_SECONDS, key=seconds)
 
 
-@ft.partial(jax.jit, static_argnames=("max_coc", "kernel", "coverage"))
-def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernel, coverage):
+@ft.partial(jax.jit, static_argnames=("max_coc", "kernels", "coverage"))
+def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernels, coverage):
     seen = pixels(image, depth, lens)
     operands = seen.image, seen.depth, lens, gamma, epsilon, seen.missing
-    result = _in_or_out_of_focus(*operands, max_coc, kernel, coverage)
+    result = _in_or_out_of_focus(*operands, max_coc, kernels, coverage)
     spoils = spoiled(seen.bad, lens.circle_of_confusion(seen.depth), max_coc) | seen.lost
     return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)

@@ -22,7 +22,7 @@ MISSING = [0.0, -0.0, -3.0, -np.inf, np.nan]
 METHODS = {
     **{
         f"scatter {kernel}": ft.partial(dof.scatter, kernel=kernel, gamma=0.5)
-        for kernel in ("segment_sum", "shift", "tiles", "spans")
+        for kernel in ("segment_sum", "shift", "tiles", "spans", "rows")
     },
     "layered": dof.layered,
     "depth_sorted": dof.depth_sorted,
@@ -35,7 +35,8 @@ METHODS = {
     "implicit_diffusion": dof.implicit_diffusion,
 }
 # All kernels of a function read their arguments in one place: the quick form takes one of them.
-KERNELS = {"scatter shift", "scatter tiles", "scatter spans", "depth_sorted all", "gather 13"}
+SUMS = {f"scatter {kernel}" for kernel in ("shift", "tiles", "spans", "rows")}
+KERNELS = SUMS | {"depth_sorted all", "gather 13"}
 EACH = [
     pytest.param(name, marks=pytest.mark.full if name in KERNELS else ()) for name in METHODS
 ]
@@ -159,7 +160,7 @@ def test_scatter_of_holes_is_the_mean_of_all_others():
     np.testing.assert_allclose(drawn("scatter shift")(image, depth, LENS), expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("kernel", ["shift", "tiles", "spans"])
+@pytest.mark.parametrize("kernel", ["shift", "tiles", "spans", "rows"])
 @pytest.mark.full
 def test_kernels_of_scatter_agree_about_holes(kernel):
     image, depth = scene(3, (30, 34))

@@ -15,7 +15,7 @@ from jaxfx import FocusPlanes, ThinLens, dof
 from tests.helpers.forms import first
 
 
-KERNELS = ("segment_sum", "shift", "tiles", "spans")
+KERNELS = ("segment_sum", "shift", "tiles", "spans", "rows")
 
 
 def row_area(radius, row):

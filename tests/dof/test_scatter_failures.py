@@ -8,7 +8,7 @@ from jaxfx import ThinLens, dof
 from tests.helpers.forms import first
 
 
-KERNELS = ("segment_sum", "shift", "tiles")
+KERNELS = ("segment_sum", "shift", "tiles", "rows")
 WIDTH, EDGE, RADIUS = 41, 20, 6.0
 COLUMNS = np.arange(WIDTH) + 0.5 - EDGE  # signed distance of a pixel's centre from the edge
 

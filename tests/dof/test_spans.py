@@ -163,7 +163,7 @@ def test_auto_looks_at_the_data_where_it_can(monkeypatch):
     assert asked == [(5, 6, largest), (5, 6, 9), (5, 6, largest), (5, 6, largest)]
 
 
-@first("kernel", ["segment_sum", "shift", "tiles", "spans"])
+@first("kernel", ["segment_sum", "shift", "tiles", "spans", "rows"])
 @pytest.mark.full
 def test_solvers_run_on_every_kernel(kernel):
     rng = np.random.default_rng(6)

@@ -1,17 +1,18 @@
 """What bad pixels spoil, and that a batch computes it only where there are any."""
 
+import contextlib
 import functools as ft
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.extend import core
 
 from jaxfx import ThinLens, dof
 from jaxfx.dof import _spoiled
 from jaxfx.dof._spoiled import spoiled
 from tests.helpers.forms import first
+from tests.helpers.programs import for_accelerators, primitives
 
 
 LENS = ThinLens(0.1, 2.5, 200.0)
@@ -32,33 +33,23 @@ def discs(bad, diameter, margin):
     return found
 
 
+@pytest.mark.parametrize("on", [contextlib.nullcontext, for_accelerators])
 @pytest.mark.parametrize("max_coc", [5.0, 40.0])
-def test_it_is_what_their_discs_overlap(max_coc):
+def test_it_is_what_their_discs_overlap(max_coc, on):
     """All pixels whose centre lies in a disc, and none beside it; of no number the largest.
 
-    The wide one is counted by tiles.
+    On a CPU the wide one is counted by tiles.
     """
     rng = np.random.default_rng(0)
     coc = rng.uniform(0, 12, (70, 60))
     bad = rng.random((70, 60)) < 0.002
     coc[*np.argwhere(bad)[0]], coc[*np.argwhere(bad)[1]] = np.nan, np.inf
     diameter = np.where(coc < max_coc, coc, max_coc)
-    found = np.asarray(spoiled(jnp.asarray(bad), jnp.asarray(coc), max_coc))
+    with on():
+        found = np.asarray(spoiled(jnp.asarray(bad), jnp.asarray(coc), max_coc))
     assert found[discs(bad, diameter, 0)].all()
     assert not found[~discs(bad, diameter, 0.5)].any()
     assert not found.all()
-
-
-def primitives(jaxpr, skip=()):
-    """The names of all operations, but for those inside of what is skipped."""
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        if equation.primitive.name not in skip:
-            for inner in jax.tree.leaves(
-                equation.params, is_leaf=lambda x: isinstance(x, core.ClosedJaxpr | core.Jaxpr)
-            ):
-                if isinstance(inner, core.ClosedJaxpr | core.Jaxpr):
-                    yield from primitives(getattr(inner, "jaxpr", inner), skip)
 
 
 @first("name", METHODS)
