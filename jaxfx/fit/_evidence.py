@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx.fit._descent import covariance, standard_errors, tiles
-from jaxfx.fit._lighting import Model, middle, with_values
+from jaxfx.fit._lighting import Model, middle_of, with_values
 from jaxfx.fit._robust import CUT, flatness, lengths
 from jaxfx.light import Light
 
@@ -27,8 +27,8 @@ LEAST_NOISE = 1e-3
 # the picture, root mean square, over the picture's.
 _MOST_ERROR = 0.2
 
-# A picture whose contrast is a smaller share of its root mean square is taken to have so much: on
-# an even wall, noise is all the contrast that there is.
+# A picture whose contrast is a smaller share of its root mean square is taken to have so much:
+# on an even wall, noise is all the contrast that there is.
 _LEAST_CONTRAST = 0.1
 
 Errors = tuple[dict[str, Float[Array, "..."]], ...]
@@ -54,13 +54,15 @@ def evidence(
     given: Float[Array, "height width"],
     weight: Float[Array, "height width"],
     noise: Float[Array, "2"],
-    least: Float[Array, ""],
 ) -> Evidence:
     """From the picture at the end of a search and its derivatives, and what pixels counted.
 
     The columns are in the order of the lights and of their values. `noise` is inf where all
-    counted as given; `least` is a noise that any picture has.
+    counted as given.
     """
+    exact = lambda *arrays: (array.astype(float) for array in arrays)
+    columns, image, reference, noise = exact(columns, image, reference, noise)
+    given, weight, seen = exact(given, weight, _basis(model, lights))
     root = jnp.sqrt(weight)[..., None]
     columns = jnp.repeat(root, 3, axis=2).reshape(-1, 1) * columns
     length = lengths(image - reference, given)
@@ -68,6 +70,7 @@ def evidence(
     residual = root * jnp.where(flat > 0, (image - reference) / flat, jnp.inf)
     block, count = tiles(residual.shape)
     variances = jnp.diagonal(covariance(columns, residual.reshape(-1), block, count))
+    least = LEAST_NOISE * brightness(reference, given)
     floor = standard_errors(columns, jnp.full_like(residual, least))
     errors = jnp.sqrt(jnp.maximum(variances, floor**2))
     projection = _projection(np.asarray(columns, np.float64))
@@ -75,12 +78,11 @@ def evidence(
     errors = jnp.where(is_untold | jnp.isnan(errors), jnp.inf, errors)
     owners = [i for i, each in enumerate(map(model.values, lights)) for _ in _flat(each)]
     found = _by_light(model, lights, errors)
-    seen = _basis(model, lights)
     return Evidence(
         found,
         _groups(projection, np.array(owners)),
         _untold(model, lights, found, seen, reference, given),
-        jnp.sum(weight * jnp.any(seen != 0, axis=(0, 3))) / jnp.sum(given),
+        jnp.sum(jnp.where(jnp.any(seen != 0, axis=(0, 3)), weight, 0)) / jnp.sum(given),
         _explained(reference, given, jnp.minimum(length[0], CUT * noise[0])),
     )
 
@@ -146,7 +148,7 @@ def _untold(
             if name == "color":
                 size = whole / brightness(white, given)
             elif name == "position":
-                lit_middle = middle(model.gbuffer, model.camera, lit)
+                lit_middle = middle_of(model.gbuffer, model.camera, lit)
                 size = jnp.linalg.norm(light.position - lit_middle)
             if not jnp.linalg.norm(error) <= _MOST_ERROR * size:
                 names.append((index, name))

@@ -179,7 +179,7 @@ def spread(gbuffer: GBuffer, camera: _Camera) -> Float[Array, ""]:
     return jnp.asarray(spread if spread > 0 else 1.0, float)
 
 
-def middle(
+def middle_of(
     gbuffer: GBuffer, camera: _Camera, weight: Float[Array, "height width"]
 ) -> Float[np.ndarray, "3"]:
     """The mean of the visible points by weight; of all where that is nowhere."""

@@ -26,7 +26,7 @@ from jaxfx._checks import (
 from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.fit._descent import End, Solver, descend
-from jaxfx.fit._evidence import LEAST_NOISE, brightness, evidence, linearized
+from jaxfx.fit._evidence import evidence, linearized
 from jaxfx.fit._light_search import search_in_rounds, search_once
 from jaxfx.fit._lighting import Model, free
 from jaxfx.gbuffer import GBuffer
@@ -200,8 +200,7 @@ def _fitted(
     """The result at the end of a search: lights, picture, errors and quality."""
     found = end.unknowns
     image, columns = linearized(model, found)
-    least = LEAST_NOISE * brightness(reference, given)
-    proof = evidence(model, found, columns, image, reference, given, weight, noise, least)
+    proof = evidence(model, found, columns, image, reference, given, weight, noise)
     return LightsFit(
         found,
         image,
