@@ -1,6 +1,6 @@
 """What a picture tells of its lights: standard errors, and what can't be told apart."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,6 +17,12 @@ from jaxfx.light import Light
 # Columns of the normal matrix, each of length 1, are taken for dependent where a combination
 # of length 1 is shorter than a thousandth; lights for one group where they share in it so much.
 _DEPENDENT, _SHARED = 1e-6, 1e-2
+
+# Two lights of one kind are as one where their places and directions differ by less than so
+# many of their joint standard errors: brightness may then go from one to the other, by far more
+# than derivatives tell. With a smaller number chance makes two lights of one, with a larger one
+# lights that are apart are called one.
+_APART = 3.0
 
 # The noise of any picture is at least this share of its root mean square, about that of 8
 # bits: less makes no outlier, and nothing is stated to be surer than with such noise.
@@ -78,9 +84,13 @@ def evidence(
     errors = jnp.where(is_untold | jnp.isnan(errors), jnp.inf, errors)
     owners = [i for i, each in enumerate(map(model.values, lights)) for _ in _flat(each)]
     found = _by_light(model, lights, errors)
+    near = _near(lights, found)
+    for index in {index for pair in near for index in pair}:
+        if "color" in found[index]:
+            found[index]["color"] = jnp.full(3, jnp.inf)
     return Evidence(
         found,
-        _groups(projection, np.array(owners)),
+        _groups([*near, *_dependent(projection, np.array(owners))]),
         _untold(model, lights, found, seen, reference, given),
         jnp.sum(jnp.where(jnp.any(seen != 0, axis=(0, 3)), weight, 0)) / jnp.sum(given),
         _explained(reference, given, jnp.minimum(length[0], CUT * noise[0])),
@@ -182,15 +192,40 @@ def _projection(columns: Float[np.ndarray, "residual number"]) -> np.ndarray:
     return null @ null.T
 
 
-def _groups(projection: np.ndarray, owners: np.ndarray) -> Groups:
-    """Lights that share in combinations of columns that change nothing, in groups."""
+def _dependent(projection: np.ndarray, owners: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of lights that share in combinations of columns that change nothing."""
     lights = np.unique(owners).tolist()
+    shared = lambda i, j: np.linalg.norm(projection[owners == i][:, owners == j])
+    return [(i, j) for i in lights for j in lights if i < j and shared(i, j) > _SHARED]
+
+
+def _near(lights: tuple[Light, ...], errors: Errors) -> list[tuple[int, int]]:
+    """Pairs of lights of one kind that were moved and are as one within their errors."""
+    pairs = []
+    for i, one in enumerate(lights):
+        for j, other in enumerate(lights[:i]):
+            names = [name for name in ("position", "direction") if name in errors[i]]
+            if type(one) is not type(other) or not names:
+                continue
+            if all(_apart(one, other, name, errors[i], errors[j]) < _APART for name in names):
+                pairs.append((j, i))
+    return pairs
+
+
+def _apart(one: Any, other: Any, name: str, error: Any, other_error: Any) -> float:
+    """How far apart the places or the directions of two lights are, in joint errors."""
+    values = [np.asarray(getattr(light, name), np.float64) for light in (one, other)]
+    if name == "direction":
+        values = [value / np.linalg.norm(value) for value in values]
+    joint = np.linalg.norm([*np.ravel(error[name]), *np.ravel(other_error[name])])
+    return float(np.linalg.norm(values[0] - values[1]) / joint)
+
+
+def _groups(pairs: list[tuple[int, int]]) -> Groups:
+    """What is joined by pairs."""
     groups: list[set[int]] = []
-    for i in lights:
-        for j in lights:
-            shared = np.linalg.norm(projection[owners == i][:, owners == j])
-            if i < j and shared > _SHARED:
-                touched = [group for group in groups if group & {i, j}]
-                groups = [group for group in groups if group not in touched]
-                groups.append({i, j}.union(*touched))
+    for pair in pairs:
+        touched = [group for group in groups if group & {*pair}]
+        groups = [group for group in groups if group not in touched]
+        groups.append({*pair}.union(*touched))
     return tuple(sorted(tuple(sorted(group)) for group in groups))

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 CUT = 5.5
 
 # The side of a window, in pixels. Without one, 60 to 90 % of what is found lies within 1.96
-# stated errors where there are shadows and noise of 3 %, with it 85 to 95 %. A larger one leaves
-# out more about each shadow.
+# stated errors where there are shadows and noise of 3 %, with it 85 to 95 %. A larger one
+# leaves out more about each shadow.
 _WINDOW = 5
 
 # The median length of three independent Gaussians of variance 1.

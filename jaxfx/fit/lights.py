@@ -59,8 +59,9 @@ class LightsFit(eqx.Module):
       to say. It knows nothing of other minima.
     - `indistinct`: groups of lights, by their indices, that the picture can't tell apart: it
       stays the same, to a thousandth of what each change alone would do, when the parameters of
-      all the group's lights change together. Colours within a group are the smallest, and what
-      takes part in the change has an error of inf.
+      all the group's lights change together; or they are of one kind, and where they are and
+      where to they shine differs by less than three stated errors. Colours of dependent lights
+      are the smallest. What takes part in the change, and the colours, have an error of inf.
     - `untold`: what has too large an error to be called known, as the index of its light and
       its name.
     - `weights`: height width, how much the square of each pixel's difference counted in the
