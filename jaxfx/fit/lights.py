@@ -126,45 +126,52 @@ def lights(
 ) -> LightsFit:
     """The lights under which a deep frame buffer looks most like a reference.
 
-    Least squares over all pixels and channels. The picture is linear in the colours: for given
-    positions, directions and angles the best ones are solved for, and only the rest is searched
-    (variable projection). Directions move on the sphere; a cone stays in order,
-    0 < inner < outer < pi, by logistic functions. Colours are not forced to be positive: a
-    negative one says that the model does not fit.
+    Weighted least squares. The picture is linear in the colours: for given positions,
+    directions and angles the best ones are solved for, and only the rest is searched (variable
+    projection). Then pixels are weighed anew by what they differ, and so on: shadows that the
+    model lacks, highlights that are clipped and unknown materials come to have no say. A weight
+    is Tukey's biweight of a pixel's difference and that of the sum over 5 x 5 about it, each by
+    its noise, which medians tell, and which is eased down, by halves, from what is far off at
+    the start.
 
-    The search is local. Started too far away it may end in another minimum. What changes
-    nothing to begin with, the place of a light that lights nothing say, has no derivative to
-    move it: it stays, and the log says so.
+    Directions move on the sphere; a cone stays in order by logistic functions. A negative
+    colour says that the model does not fit. The search is local. What changes nothing to begin
+    with, the place of a light that lights nothing say, stays, and the log says so.
 
     **Arguments:**
 
     - `reference`: height width 3, linear radiance.
-    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing (0, negative, NaN)
-      a pixel has no say.
+    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing or inf, or the
+      shader is -1, a pixel has no say.
     - `lights`: their number and kinds, and where the search starts; colours count only if they
       are not fitted.
     - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
       function of the light that gives that and can be differentiated, a `MovingShadow` say. Or,
       for shadows that are made anew in each round, a function of the lights (those found so
       far) and of the round (0, 1, ...) that gives such entries.
+    - `weights`: height width, no unit: how much the square of each pixel's difference counts,
+      besides; 0 leaves a pixel out.
+    - `loss`: `"robust"`, or `"squares"`, where pixels count as given: what `robust` takes for
+      wrong, the edge of a shadow say, may be all that tells where a light is.
     - `rounds`: how often to search, each time from where the last ended.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.LIGHT_PARAMETERS`; the others stay as given.
-    - `max_steps`: of the solver, in each round.
-    - `throw`: raise where the last round fails; else the failure stands in the result.
+    - `max_steps`: of the solver, each time it starts.
+    - `throw`: raise where the fit is no success; else the failure stands in the result.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `LightsFit`.
 
     **Raises:** `ValueError` for what `relight.shade` refuses, for shapes or numbers of entries
     that differ, parameters that no light has, a reference that is not finite, or a start where
-    nothing changes the image. `RuntimeError` where the last round fails and `throw` is true.
+    nothing changes the image. `RuntimeError` where the fit is no success and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
 
-    Source: the elimination of the linear unknowns is Golub & Pereyra 1973; that the colours of
-    lights are a linear problem, Schoeneman et al. 1993.
+    Source: Golub & Pereyra 1973, variable projection; Schoeneman et al. 1993, colours as a
+    linear problem; Beaton & Tukey 1974, the weights; Blake & Zisserman 1987, easing down; the
+    windows, and the bounds of success, are our own.
     """
     gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
     check_camera("lights(camera)", camera)
@@ -185,24 +192,23 @@ def lights(
                 model, lights, reference, given, loss == "robust", descend_on
             ),
         )
-    fitted = _fitted(model, end, reference, given, weight, noise)
-    if throw and not fitted.success:
-        raise RuntimeError(
-            f"`lights` found no lights in {len(end.losses)} steps, the mean squared residual "
-            f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {fitted.doubt} "
-            "`throw=False` returns what was reached."
-        )
-    return fitted
+    return _fitted(model, end, reference, given, weight, noise, throw)
 
 
 def _fitted(
-    model: Model, end: End, reference: Array, given: Array, weight: Array, noise: Array
+    model: Model,
+    end: End,
+    reference: Array,
+    given: Array,
+    weight: Array,
+    noise: Array,
+    throw: bool,
 ) -> LightsFit:
     """The result at the end of a search: lights, picture, errors and quality."""
     found = end.unknowns
     image, columns = linearized(model, found)
     proof = evidence(model, found, columns, image, reference, given, weight, noise)
-    return LightsFit(
+    fitted = LightsFit(
         found,
         image,
         jnp.stack(end.losses),
@@ -214,6 +220,13 @@ def _fitted(
         proof.explained,
         end.result,
     )
+    if throw and not fitted.success:
+        raise RuntimeError(
+            f"`lights` found no lights in {len(end.losses)} steps, the mean squared residual "
+            f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {fitted.doubt} "
+            "`throw=False` returns what was reached."
+        )
+    return fitted
 
 
 def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
