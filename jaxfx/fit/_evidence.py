@@ -151,7 +151,8 @@ def _untold(
 ) -> tuple[tuple[int, str], ...]:
     """The parameters, by light and name, that are not known."""
     whole, names = brightness(reference, given), []
-    for index, (light, own, white) in enumerate(zip(lights, errors, basis, strict=True)):
+    each: tuple[Any, ...] = lights
+    for index, (light, own, white) in enumerate(zip(each, errors, basis, strict=True)):
         lit = given * jnp.sum(white, axis=-1)
         for name, error in own.items():
             size = 1.0

@@ -62,8 +62,9 @@ def search_once(
     unknowns, weight, losses = search.unknowns(), given, []
     noise = jnp.full(2, jnp.inf, reference.dtype)
     is_last = not is_robust
+    end = End(unknowns, [], verdict(optx.RESULTS.successful))
+    found = _shown(search, unknowns, reference, jnp.sqrt(given)[..., None])
     if is_robust:  # What is far off at the start, a lamp in the picture, has no say from then.
-        found = _shown(search, unknowns, reference, jnp.sqrt(given)[..., None])
         noise, weight = _reweighted(model, found, reference, given, noise, unit)
     for left in reversed(range(_REWEIGHTINGS)):
         root = jnp.sqrt(weight)[..., None]
@@ -72,8 +73,7 @@ def search_once(
         if any(unknowns):
             end = descend_on(residual, unknowns, **({} if is_last else _LOOSE))
         else:
-            done = verdict(optx.RESULTS.successful)
-            end = End(unknowns, [_mean_square(residual, unknowns)], done)
+            end = end._replace(losses=[_mean_square(residual, unknowns)])
         unknowns = end.unknowns
         losses += end.losses
         found = _shown(search, unknowns, reference, root)

@@ -184,14 +184,15 @@ def middle_of(
 ) -> Float[np.ndarray, "3"]:
     """The mean of the visible points by weight; of all where that is nowhere."""
     points, shown = _points(gbuffer, camera)
-    weight = np.where(shown, np.asarray(weight, np.float64), 0)
-    weight = weight if weight.sum() > 0 else 1.0 * shown
-    return np.einsum("hw,hwc->c", weight, points) / max(weight.sum(), 1e-30)
+    counts = np.where(shown, np.asarray(weight, np.float64), 0)
+    counts = counts if counts.sum() > 0 else np.ones(shown.shape)
+    return np.einsum("hw,hwc->c", counts, points) / counts.sum()
 
 
 def _points(gbuffer: GBuffer, camera: _Camera) -> tuple[np.ndarray, np.ndarray]:
     """The point that each pixel shows, in world space, and where it shows one."""
     shown = (gbuffer.depth > 0) & jnp.isfinite(gbuffer.depth)
-    pixels = pixel_centers(*shown.shape, gbuffer.depth.dtype)
+    height, width = shown.shape
+    pixels = pixel_centers(height, width, gbuffer.depth.dtype)
     points = camera.unproject(pixels, jnp.where(shown, gbuffer.depth, 1))
     return np.asarray(points, np.float64), np.asarray(shown)

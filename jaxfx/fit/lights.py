@@ -132,7 +132,7 @@ def lights(
     model lacks, highlights that are clipped and unknown materials come to have no say. A weight
     is Tukey's biweight of a pixel's difference and that of the sum over 5 x 5 about it, each by
     its noise, which medians tell, and which is eased down, by halves, from what is far off at
-    the start.
+    the start. Huber's loss does not do: a shadow only takes light away, and its pull stays.
 
     Directions move on the sphere; a cone stays in order by logistic functions. A negative
     colour says that the model does not fit. The search is local. What changes nothing to begin

@@ -17,6 +17,7 @@ def _lit(change, loss, **options):
     """Of so many fits: the largest median miss of a place or a direction, in scene units and
     radians; the share of numbers that lie outside of 1.96 stated errors; that of failures."""
     off, outside, failures = [], [], []
+    image = weight = np.zeros((1, 1, 3))
     for seed in range(COUNT):
         image, truth, start = change(seed)
         how = {"loss": loss, "throw": False, **options}
@@ -27,16 +28,16 @@ def _lit(change, loss, **options):
         miss, error = (np.concatenate(each) for each in zip(*pairs.values(), strict=True))
         outside.append(np.mean(np.abs(miss) > 1.96 * error))
         failures.append(not found.success)
+        weight = np.asarray(found.weights)[..., None] * np.ones(3)
     figures = {
         "off": float(np.median(off)),
         "outside": float(np.mean(outside)),
         "failures": float(np.mean(failures)),
     }
-    weight = np.asarray(found.weights)[..., None] * np.ones(3)
     return Found(figures, np.concatenate([np.clip(image / 3, 0, 1), weight], axis=1))
 
 
-ASKED = {"off": 0.02, "outside": 0.15, "failures": 0.0}
+ASKED: dict[str, float | None] = {"off": 0.02, "outside": 0.15, "failures": 0.0}
 NONE = "none: a search stops at every step to report"
 
 
@@ -88,7 +89,7 @@ def lights_that_cannot_be_told_apart(loss):
     the share that is called a success, and that of colours with a finite stated error."""
     successes, finite = [], []
     truth = [DirectionalLight([0.3, y, 1.0], np.ones(3)) for y in (0.2, 0.21)]
-    clean = np.asarray(relight.render(lit.cache(), lit.CAMERA, truth))
+    image = clean = np.asarray(relight.render(lit.cache(), lit.CAMERA, truth))
     for seed in range(COUNT):
         grain = np.random.default_rng(seed).normal(size=clean.shape)
         image = clean + 0.01 * np.sqrt(np.mean(clean**2)) * grain

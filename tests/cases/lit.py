@@ -19,6 +19,7 @@ from jaxfx import (
 
 SIZE = 32
 CAMERA = OrthographicCamera(SIZE / 4, jnp.array([SIZE / 2, SIZE / 2]), jnp.eye(4))
+ANGLES = "inner_angle", "outer_angle"
 
 
 @functools.cache
@@ -134,8 +135,8 @@ def misses(fitted, truth):
                 one, other = (way / np.linalg.norm(way) for way in ways)
                 miss = 2 * np.arcsin(np.linalg.norm(one - other) / 2) / parts
             elif name == "angles":
-                both = [[each.inner_angle, each.outer_angle] for each in (light, true)]
-                miss = np.subtract(*both)
+                inner, outer = (getattr(light, n) - getattr(true, n) for n in ANGLES)
+                miss = np.array([inner, outer])
             else:
                 miss = np.asarray(getattr(light, name) - getattr(true, name))
             found[index, name] = np.atleast_1d(miss), np.atleast_1d(error) / parts

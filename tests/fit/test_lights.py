@@ -145,7 +145,7 @@ SUNS = (
 def test_colors_alone_are_a_linear_problem():
     """By NumPy's least squares, of a reference that no lights explain; and the errors by those
     without each of 8 x 8 tiles in turn."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(9)  # The surface's colours are drawn from 0.
     reference = rng.uniform(size=(SIZE, SIZE, 3))
     masks = [None, rng.uniform(size=(SIZE, SIZE)), rng.integers(0, 2, (SIZE, SIZE)) * 1.0]
     white = [type(light)(**vars(light) | {"color": WHITE}) for light in SUNS]
