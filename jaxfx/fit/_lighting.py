@@ -165,8 +165,8 @@ def best_colors(
     root: Float[Array, "height width 1"],
 ) -> Float[np.ndarray, "3 light"]:
     """The best colours, the smallest of them where several are as good."""
-    basis, reference, root = (np.asarray(each, np.float64) for each in (basis, reference, root))
-    columns, right = root * basis, root * reference
+    white, aim, weight = (np.asarray(each, np.float64) for each in (basis, reference, root))
+    columns, right = weight * white, weight * aim
     solve = lambda a, b: np.linalg.lstsq(a.reshape(len(a), -1).T, b.ravel(), rcond=1e-6)[0]
     return np.stack([solve(columns[..., c], right[..., c]) for c in range(3)])
 
