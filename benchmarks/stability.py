@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tests.cases.registry import Case
 
 
-EFFECTS = ("dof", "blur", "reproject", "shadow", "relight")
+EFFECTS = ("dof", "blur", "reproject", "shadow", "relight", "fit")
 PUBLISHED = Path(__file__).parents[1] / "docs/stability"
 TILE, ACROSS = 48, 16
 KINDS = re.compile(r"\b(zero|biased|missing|none)\b")

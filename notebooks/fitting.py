@@ -103,14 +103,14 @@ print(f"{len(fitted.losses)} losses, from {fitted.losses[0]:.1e} to {fitted.loss
 # %% [markdown]
 # Some lights can't be told apart, whatever the search does. On a wall that is matt and flat,
 # every sun is the same as every other, and as the sky. `indistinct` names such groups: lights
-# whose parameters can change together without the picture changing.
+# whose parameters can change together without the picture changing. Such a fit is no success,
+# and raises unless `throw=False`; `doubt` says why.
 
 # %%
 suns = [truth[0], AmbientLight(white), truth[0]]
 picture = relight.render(gbuffer, camera, suns)
-print(
-    fit.lights(picture, gbuffer, camera, suns, parameters=("color",), progress=False).indistinct
-)
+told = fit.lights(picture, gbuffer, camera, suns, parameters=("color",), throw=False)
+print(told.indistinct, told.doubt)
 
 # %% [markdown]
 # ## A sun by its shadow
@@ -272,6 +272,7 @@ fitted = fit.lights(
     [AmbientLight(white), wrong],
     visibility=shadows,
     rounds=len(scales),
+    loss="squares",
     progress=False,
 )
 print(f"in the end: {degrees_off(fitted.lights[1]):.2f} degrees off")

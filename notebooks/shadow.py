@@ -346,6 +346,7 @@ found = fit.lights(
     start,
     visibility=boxes.shadows,
     rounds=len(boxes.scales),
+    loss="squares",
     progress=False,
 )
 print(f"{boxes.miss(start[1]):.0f} degrees at first, {boxes.miss(found.lights[1]):.2f} at last")

@@ -124,21 +124,25 @@ class Search(eqx.Module):
 
 
 class Residual(eqx.Module):
-    """The picture less the reference, over the reference's root mean square."""
+    """The picture less the reference, over the reference's root mean square, as it counts.
+
+    - `root`: height width 1, the root of each pixel's weight.
+    """
 
     search: Search
     reference: Float[Array, "height width 3"]
     unit: Float[Array, ""]
+    root: Float[Array, "height width 1"]
 
     def __call__(self, unknowns: list[Values]) -> Float[Array, "height width 3"]:
         model, lights = self.search.model, self.search.lights(unknowns)
         if "color" in model.names:
             basis = model.basis(lights)
-            colors = _ridge_colors(basis, self.reference)
+            colors = _ridge_colors(self.root[None] * basis, self.root * self.reference)
             image = jnp.einsum("lc,lhwc->hwc", colors, basis)
         else:
             image = model(lights)
-        return ((image - self.reference) / self.unit).astype(float)
+        return (self.root * (image - self.reference) / self.unit).astype(float)
 
 
 def _ridge_colors(
@@ -156,19 +160,39 @@ def _ridge_colors(
 
 
 def best_colors(
-    basis: Float[Array, "light height width 3"], reference: Float[Array, "height width 3"]
+    basis: Float[Array, "light height width 3"],
+    reference: Float[Array, "height width 3"],
+    root: Float[Array, "height width 1"],
 ) -> Float[np.ndarray, "3 light"]:
     """The best colours, the smallest of them where several are as good."""
-    columns, right = np.asarray(basis, np.float64), np.asarray(reference, np.float64)
+    white, aim, weight = (np.asarray(each, np.float64) for each in (basis, reference, root))
+    columns, right = weight * white, weight * aim
     solve = lambda a, b: np.linalg.lstsq(a.reshape(len(a), -1).T, b.ravel(), rcond=1e-6)[0]
     return np.stack([solve(columns[..., c], right[..., c]) for c in range(3)])
 
 
 def spread(gbuffer: GBuffer, camera: _Camera) -> Float[Array, ""]:
     """How far the visible points are from their mean, root mean square; 1 for a single one."""
+    points, shown = _points(gbuffer, camera)
+    points = points[shown]
+    spread = np.sqrt(np.var(points, axis=0).sum()) if len(points) else 0.0
+    return jnp.asarray(spread if spread > 0 else 1.0, float)
+
+
+def middle_of(
+    gbuffer: GBuffer, camera: _Camera, weight: Float[Array, "height width"]
+) -> Float[np.ndarray, "3"]:
+    """The mean of the visible points by weight; of all where that is nowhere."""
+    points, shown = _points(gbuffer, camera)
+    counts = np.where(shown, np.asarray(weight, np.float64), 0)
+    counts = counts if counts.sum() > 0 else np.ones(shown.shape)
+    return np.einsum("hw,hwc->c", counts, points) / counts.sum()
+
+
+def _points(gbuffer: GBuffer, camera: _Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The point that each pixel shows, in world space, and where it shows one."""
     shown = (gbuffer.depth > 0) & jnp.isfinite(gbuffer.depth)
     height, width = shown.shape
     pixels = pixel_centers(height, width, gbuffer.depth.dtype)
-    points = np.asarray(camera.unproject(pixels, jnp.where(shown, gbuffer.depth, 1)))[shown]
-    spread = np.sqrt(np.var(points, axis=0).sum()) if len(points) else 0.0
-    return jnp.asarray(spread if spread > 0 else 1.0, float)
+    points = camera.unproject(pixels, jnp.where(shown, gbuffer.depth, 1))
+    return np.asarray(points, np.float64), np.asarray(shown)

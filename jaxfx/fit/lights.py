@@ -1,8 +1,8 @@
 """The lights of a picture, from it and a deep frame buffer: inverse lighting."""
 
-import logging
-from collections.abc import Callable, Collection, Sequence
-from typing import Any, final
+from collections.abc import Collection, Sequence
+from functools import partial
+from typing import Any, Literal, final, get_args
 
 import equinox as eqx
 import jax
@@ -10,34 +10,36 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_lights
-from jaxfx._checks import WholeNumber, check, check_image, items, share, whole_number
+from jaxfx._checks import (
+    WholeNumber,
+    check,
+    check_depth,
+    check_image,
+    items,
+    option,
+    share,
+    whole_number,
+)
 from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.fit._descent import End, Solver, descend, standard_errors, verdict
-from jaxfx.fit._lighting import (
-    Model,
-    Residual,
-    Search,
-    Values,
-    best_colors,
-    free,
-    spread,
-    with_values,
-)
+from jaxfx.fit._descent import End, Solver, descend
+from jaxfx.fit._evidence import evidence, linearized
+from jaxfx.fit._light_search import search_in_rounds, search_once
+from jaxfx.fit._lighting import Model, free
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import Light
 
 
-_logger = logging.getLogger("jaxfx")
-
 LIGHT_PARAMETERS = ("color", "position", "direction", "angles")
 
-# Columns of the normal matrix, each of length 1, are taken for dependent where a combination
-# of length 1 is shorter than a thousandth; lights for one group where they share in it so much.
-_DEPENDENT, _SHARED = 1e-6, 1e-2
+# What lights must meet to be trusted, both ratios. With a lower share a few pixels decide; a
+# lower share of the contrast is what lights explain of pictures that they did not light.
+_LEAST_SHARE, _LEAST_EXPLAINED = 0.05, 0.7
+
+Loss = Literal["robust", "squares"]
 
 
 @final
@@ -46,16 +48,29 @@ class LightsFit(eqx.Module):
 
     - `lights`: the lights, in the order given; what was frozen as it was.
     - `image`: height width 3, the picture under them.
-    - `losses`: the mean squared residual at the start of each round and after every step, in
-      squared units of radiance, always with the best colours where colours are fitted.
+    - `losses`: the mean squared residual, as weighted at the time, at the start of each search
+      and after every step, in squared units of radiance, always with the best colours where
+      colours are fitted. It jumps where the weights of pixels are made anew.
     - `uncertainty`: for each light a standard error of every parameter that was fitted, in its
       own unit: 3 for the colour and the position, an angle in radians for the direction, 2
-      (inner, outer) for the angles. As if the residuals were independent: compare the numbers
-      with one another. inf where the picture has nothing to say.
+      (inner, outer) for the angles. It takes the residuals of 8 x 8 tiles of the image for
+      independent of one another, and no others, and is never less than what noise of a
+      thousandth of the picture's root mean square would make. inf where the picture has nothing
+      to say. It knows nothing of other minima.
     - `indistinct`: groups of lights, by their indices, that the picture can't tell apart: it
       stays the same, to a thousandth of what each change alone would do, when the parameters of
-      all the group's lights change together. Colours within a group are the smallest.
-    - `result`: optimistix' verdict on the last round, one of its `RESULTS`; it prints as a
+      all the group's lights change together; or they are of one kind, and where they are and
+      where to they shine differs by less than three stated errors. Colours of dependent lights
+      are the smallest. What takes part in the change, and the colours, have an error of inf.
+    - `untold`: what has too large an error to be called known, as the index of its light and
+      its name.
+    - `weights`: height width, how much the square of each pixel's difference counted in the
+      end.
+    - `share`: the share of the given weight, a ratio, that counted in the end, of pixels that
+      lights reach.
+    - `explained`: the share of the picture's contrast, a ratio, that is explained: 1 leaves no
+      difference, 0 is no better than an even image.
+    - `result`: optimistix' verdict on the last search, one of its `RESULTS`; it prints as a
       sentence.
     """
 
@@ -64,12 +79,33 @@ class LightsFit(eqx.Module):
     losses: Float[Array, " steps"]
     uncertainty: tuple[dict[str, Float[Array, "..."]], ...]
     indistinct: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    untold: tuple[tuple[int, str], ...] = eqx.field(static=True)
+    weights: Float[Array, "height width"]
+    share: Float[Array, ""]
+    explained: Float[Array, ""]
     result: optx.RESULTS
 
     @property
+    def doubt(self) -> str:
+        """Why the lights are not to be trusted, as a sentence; empty where they are."""
+        if self.result != optx.RESULTS.successful:
+            return str(self.result)
+        if not self.share >= _LEAST_SHARE:
+            return f"Only {100 * float(self.share):.0f} % of the pixels have a say."
+        if not self.explained >= _LEAST_EXPLAINED:
+            return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
+        if self.indistinct:
+            groups = ["lights " + " and ".join(map(str, each)) for each in self.indistinct]
+            return f"The picture can't tell apart {'; '.join(groups)}."
+        if self.untold:
+            names = [f"the {name} of light {index}" for index, name in self.untold]
+            return f"The picture does not tell {', '.join(names)}."
+        return ""
+
+    @property
     def success(self) -> bool:
-        """Whether the solver converged."""
-        return bool(self.result == optx.RESULTS.successful)
+        """Whether the solver converged, to lights that the picture tells."""
+        return not self.doubt
 
 
 def lights(
@@ -79,6 +115,8 @@ def lights(
     lights: Sequence[Light],
     *,
     visibility: Any = None,
+    weights: Num[ArrayLike, "height width"] | None = None,
+    loss: Loss = "robust",
     rounds: WholeNumber = 1,
     solver: Solver | None = None,
     parameters: Collection[str] = LIGHT_PARAMETERS,
@@ -88,75 +126,107 @@ def lights(
 ) -> LightsFit:
     """The lights under which a deep frame buffer looks most like a reference.
 
-    Least squares over all pixels and channels. The picture is linear in the colours: for given
-    positions, directions and angles the best ones are solved for, and only the rest is searched
-    (variable projection). Directions move on the sphere; a cone stays in order,
-    0 < inner < outer < pi, by logistic functions. Colours are not forced to be positive: a
-    negative one says that the model does not fit.
+    Weighted least squares. The picture is linear in the colours: for given positions,
+    directions and angles the best ones are solved for, and only the rest is searched (variable
+    projection). Then pixels are weighed anew by what they differ, and so on: shadows that the
+    model lacks, highlights that are clipped and unknown materials come to have no say. A weight
+    is Tukey's biweight of a pixel's difference and that of the sum over 5 x 5 about it, each by
+    its noise, which medians tell, and which is eased down, by halves, from what is far off at
+    the start. Huber's loss does not do: a shadow only takes light away, and its pull stays.
 
-    The search is local. Started too far away it may end in another minimum. What changes
-    nothing to begin with, the place of a light that lights nothing say, has no derivative to
-    move it: it stays, and the log says so.
+    Directions move on the sphere; a cone stays in order by logistic functions. A negative
+    colour says that the model does not fit. The search is local. What changes nothing to begin
+    with, the place of a light that lights nothing say, stays, and the log says so.
 
     **Arguments:**
 
     - `reference`: height width 3, linear radiance.
-    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing (0, negative, NaN)
-      a pixel has no say.
+    - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing or inf, or the
+      shader is -1, a pixel has no say.
     - `lights`: their number and kinds, and where the search starts; colours count only if they
       are not fitted.
     - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
       function of the light that gives that and can be differentiated, a `MovingShadow` say. Or,
       for shadows that are made anew in each round, a function of the lights (those found so
       far) and of the round (0, 1, ...) that gives such entries.
+    - `weights`: height width, no unit: how much the square of each pixel's difference counts,
+      besides; 0 leaves a pixel out.
+    - `loss`: `"robust"`, or `"squares"`, where pixels count as given: what `robust` takes for
+      wrong, the edge of a shadow say, may be all that tells where a light is.
     - `rounds`: how often to search, each time from where the last ended.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.LIGHT_PARAMETERS`; the others stay as given.
-    - `max_steps`: of the solver, in each round.
-    - `throw`: raise where the last round fails; else the failure stands in the result.
+    - `max_steps`: of the solver, each time it starts.
+    - `throw`: raise where the fit is no success; else the failure stands in the result.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `LightsFit`.
 
     **Raises:** `ValueError` for what `relight.shade` refuses, for shapes or numbers of entries
     that differ, parameters that no light has, a reference that is not finite, or a start where
-    nothing changes the image. `RuntimeError` where the last round fails and `throw` is true.
+    nothing changes the image. `RuntimeError` where the fit is no success and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
 
-    Source: the elimination of the linear unknowns is Golub & Pereyra 1973; that the colours of
-    lights are a linear problem, Schoeneman et al. 1993.
+    Source: Golub & Pereyra 1973, variable projection; Schoeneman et al. 1993, colours as a
+    linear problem; Beaton & Tukey 1974, the weights; Blake & Zisserman 1987, easing down; the
+    windows, and the bounds of success, are our own.
     """
     gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
     check_camera("lights(camera)", camera)
-    reference, gbuffer = _known(_reference(reference, gbuffer), gbuffer)
+    reference, gbuffer, given = _known(_reference(reference, gbuffer), gbuffer, weights)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
+    option("lights(loss=...)", loss, get_args(Loss))
     rounds = whole_number("lights(rounds=...)", rounds)
     max_steps = whole_number("lights(max_steps=...)", max_steps)
     with Bar(progress, "fit") as bar:
-        model, end = _search_in_rounds(
+        descend_on = partial(descend, solver=solver, max_steps=max_steps, bar=bar)
+        model, end, weight, noise = search_in_rounds(
             rounds,
             start,
             lambda given: Model(gbuffer, camera, _entries(given, len(start), shape), names),
             visibility,
-            lambda model, lights: _search(model, lights, reference, solver, max_steps, bar),
+            lambda model, lights: search_once(
+                model, lights, reference, given, loss == "robust", descend_on
+            ),
         )
-    if throw:
-        end.check("lights", "lights")
-    found, losses = end.unknowns, end.losses
-    image, columns = _linearized(model, found)
-    errors = standard_errors(columns, image - reference)
-    owners = [i for i, each in enumerate(map(model.values, found)) for _ in _flat(each)]
-    return LightsFit(
+    return _fitted(model, end, reference, given, weight, noise, throw)
+
+
+def _fitted(
+    model: Model,
+    end: End,
+    reference: Array,
+    given: Array,
+    weight: Array,
+    noise: Array,
+    throw: bool,
+) -> LightsFit:
+    """The result at the end of a search: lights, picture, errors and quality."""
+    found = end.unknowns
+    image, columns = linearized(model, found)
+    proof = evidence(model, found, columns, image, reference, given, weight, noise)
+    fitted = LightsFit(
         found,
         image,
-        jnp.stack(losses),
-        _uncertainty(model, found, errors),
-        _dependent_groups(np.asarray(columns, np.float64), np.array(owners)),
+        jnp.stack(end.losses),
+        proof.errors,
+        proof.groups,
+        proof.untold,
+        weight,
+        proof.share,
+        proof.explained,
         end.result,
     )
+    if throw and not fitted.success:
+        raise RuntimeError(
+            f"`lights` found no lights in {len(end.losses)} steps, the mean squared residual "
+            f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {fitted.doubt} "
+            "`throw=False` returns what was reached."
+        )
+    return fitted
 
 
 def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
@@ -171,12 +241,21 @@ def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
     return reference.astype(gbuffer.color.dtype)
 
 
-def _known(reference: Array, gbuffer: GBuffer) -> tuple[Array, GBuffer]:
-    """Both black where the depth is missing: such a pixel has no say."""
-    missing = ~(gbuffer.depth > 0)
-    shader = jnp.where(missing, -1, gbuffer.shader)
+def _known(
+    reference: Array, gbuffer: GBuffer, weights: Any
+) -> tuple[Array, GBuffer, Float[Array, "height width"]]:
+    """Both black where nothing is known; and the weights, 0 there."""
+    known = (gbuffer.depth > 0) & (gbuffer.depth < jnp.inf) & (gbuffer.shader >= 0)
+    given = known.astype(reference.dtype)
+    if weights is not None:
+        weights = check_depth("lights(weights=...)", weights, gbuffer.depth.shape)
+        is_weight = lambda v: (np.isfinite(v) & (v >= 0)).all() and (v > 0).any()
+        check("lights(weights=...)", weights, is_weight, "finite, 0 or positive, and not all 0")
+        given = given * weights.astype(given.dtype)
+    known = given > 0
+    shader = jnp.where(known, gbuffer.shader, -1)
     gbuffer = eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
-    return jnp.where(missing[..., None], 0, reference), gbuffer
+    return jnp.where(known[..., None], reference, 0), gbuffer, given
 
 
 def _start(lights: Any) -> tuple[Light, ...]:
@@ -210,145 +289,3 @@ def _entries(visibility: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, 
     return tuple(
         each if each is None or callable(each) else share(name, each, shape) for each in entries
     )
-
-
-def _search_in_rounds(
-    rounds: int,
-    lights: tuple[Light, ...],
-    make: Callable[[Any], Model],
-    visibility: Any,
-    search: Callable[[Model, tuple[Light, ...]], End],
-) -> tuple[Model, End]:
-    """The last round's model and end, with the losses of all."""
-    entries_of = visibility if callable(visibility) else lambda lights, index: visibility
-
-    def search_once(lights: tuple[Light, ...], index: int) -> tuple[Model, End]:
-        model = make(entries_of(lights, index))
-        return model, search(model, lights)
-
-    model, end = search_once(lights, 0)
-    for index in range(1, rounds):
-        model, again = search_once(end.unknowns, index)
-        end = again._replace(losses=end.losses + again.losses)
-    return model, end
-
-
-def _search(
-    model: Model,
-    lights: tuple[Light, ...],
-    reference: Float[Array, "height width 3"],
-    solver: Solver | None,
-    max_steps: int,
-    bar: Bar,
-) -> End:
-    """One round: an `End` whose unknowns are the lights found."""
-    _say_what_does_not_move(model, lights)
-    search = Search(model, lights, spread(model.gbuffer, model.camera))
-    unit = jnp.sqrt(jnp.mean(reference**2))
-    residual = Residual(search, reference, jnp.where(unit > 0, unit, 1))
-    unknowns = search.unknowns()
-    if any(unknowns):
-        end = descend(residual, unknowns, solver=solver, max_steps=max_steps, bar=bar)
-    else:
-        end = End(
-            unknowns, [jnp.mean(residual(unknowns) ** 2)], verdict(optx.RESULTS.successful)
-        )
-    found = _moved(search, end.unknowns)
-    if "color" in model.names:
-        best = jnp.asarray(best_colors(_basis(model, found), reference).T, float)
-        found = [
-            eqx.tree_at(lambda light: light.color, light, color)
-            for light, color in zip(found, best, strict=True)
-        ]
-    square = residual.unit.astype(float) ** 2
-    return End(tuple(found), [loss * square for loss in end.losses], end.result)
-
-
-def _say_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None:
-    """Log what of the lights changes nothing in the image; `ValueError` if all of it does."""
-    values = [model.values(light) for light in lights]
-    # Colours that are fitted are found whatever they were.
-    white = lambda light, own: with_values(
-        light, {"color": jnp.ones(3)} if "color" in own else {}
-    )
-    columns = _linearized(model, tuple(map(white, lights, values)))[1]
-    is_moving = np.asarray(jnp.any(columns != 0, axis=0)).tolist()
-    moving, fixed = [], []
-    for index, own in enumerate(values):
-        for name, value in own.items():
-            numbers, is_moving = is_moving[: len(value)], is_moving[len(value) :]
-            (moving if any(numbers) else fixed).append(f"{name} of light {index}")
-    names = ", ".join(fixed)
-    if not moving:
-        raise ValueError(
-            "`lights(lights)` must start where something that is fitted changes the image, "
-            f"got no derivative in {names}."
-        )
-    if fixed:
-        _logger.warning("`lights` can't move %s, which changes nothing at the start.", names)
-
-
-@eqx.filter_jit
-def _moved(search, unknowns):
-    return search.lights(unknowns)
-
-
-@eqx.filter_jit
-def _basis(model, lights):
-    return model.basis(lights)
-
-
-def _flat(values: Values) -> list[Any]:
-    return [number for value in values.values() for number in value]
-
-
-@eqx.filter_jit
-def _linearized(model, lights):
-    """The picture, and its Jacobian in the order of the lights and of their values."""
-
-    def draw(values):
-        moved = [with_values(light, each) for light, each in zip(lights, values, strict=True)]
-        image = model(moved)
-        return image, image
-
-    values = [model.values(light) for light in lights]
-    jacobian, image = jax.jacfwd(draw, has_aux=True)(values)
-    blocks = [
-        each[name] for each, value in zip(jacobian, values, strict=True) for name in value
-    ]
-    columns = [block.reshape(-1, block.shape[-1]) for block in blocks]
-    return image, jnp.concatenate(columns, axis=1)
-
-
-def _uncertainty(
-    model: Model, lights: tuple[Light, ...], errors: Float[Array, " number"]
-) -> tuple[dict[str, Array], ...]:
-    """The errors by light and name; a direction's two as one angle."""
-    rest, found = list(errors), []
-    for light in lights:
-        found.append({})
-        for name, value in model.values(light).items():
-            own, rest = jnp.stack(rest[: len(value)]), rest[len(value) :]
-            found[-1][name] = jnp.sqrt(jnp.sum(own**2)) if name == "direction" else own
-    return tuple(found)
-
-
-def _dependent_groups(
-    columns: Float[np.ndarray, "residual number"], owners: np.ndarray
-) -> tuple[tuple[int, ...], ...]:
-    """Lights that share in combinations of columns that change nothing, in groups."""
-    lengths = np.linalg.norm(columns, axis=0)
-    columns, owners = columns[:, lengths > 0] / lengths[lengths > 0], owners[lengths > 0]
-    squares, vectors = np.linalg.eigh(columns.T @ columns)
-    null = vectors[:, squares < _DEPENDENT]
-    lights = np.unique(owners).tolist()
-    projection = null @ null.T
-    groups: list[set[int]] = []
-    for i in lights:
-        for j in lights:
-            shared = np.linalg.norm(projection[owners == i][:, owners == j])
-            if i < j and shared > _SHARED:
-                touched = [group for group in groups if group & {i, j}]
-                groups = [group for group in groups if group not in touched]
-                groups.append({i, j}.union(*touched))
-    return tuple(sorted(tuple(sorted(group)) for group in groups))

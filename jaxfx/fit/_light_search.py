@@ -1,0 +1,152 @@
+"""The search of `fit.lights`: least squares with weights of pixels that are made anew."""
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jaxfx.fit._descent import End, verdict
+from jaxfx.fit._evidence import LEAST_NOISE, brightness, linearized
+from jaxfx.fit._lighting import Model, Residual, Search, best_colors, spread, with_values
+from jaxfx.fit._robust import CUT, biweight, lengths, noise_of
+from jaxfx.light import Light
+
+
+_logger = logging.getLogger("jaxfx")
+
+# How often the weights of pixels are made anew, by how much the noise may seem to fall each
+# time, and the largest change of a weight that ends it.
+_REWEIGHTINGS, _EASE, _SETTLED = 32, 2.0, 1e-2
+
+# A search between two sets of weights has converged when so many steps gain less than this
+# share.
+_LOOSE = {"patience": 2, "gain": 1e-2}
+
+
+def search_in_rounds(
+    rounds: int,
+    lights: tuple[Light, ...],
+    make: Callable[[Any], Model],
+    visibility: Any,
+    search: Callable[[Model, tuple[Light, ...]], tuple[End, Array, Array]],
+) -> tuple[Model, End, Array, Array]:
+    """The last round's model, end, weights and noise, with the losses of all."""
+    entries_of = visibility if callable(visibility) else lambda lights, index: visibility
+
+    model = make(entries_of(lights, 0))
+    end, weight, noise = search(model, lights)
+    for index in range(1, rounds):
+        model = make(entries_of(end.unknowns, index))
+        again, weight, noise = search(model, end.unknowns)
+        end = again._replace(losses=end.losses + again.losses)
+    return model, end, weight, noise
+
+
+def search_once(
+    model: Model,
+    lights: tuple[Light, ...],
+    reference: Float[Array, "height width 3"],
+    given: Float[Array, "height width"],
+    is_robust: bool,
+    descend_on: Callable[..., End],
+) -> tuple[End, Float[Array, "height width"], Float[Array, "2"]]:
+    """One round: an `End` whose unknowns are the lights found; weights and noise of its end."""
+    _say_what_does_not_move(model, lights)
+    search = Search(model, lights, spread(model.gbuffer, model.camera))
+    unit = brightness(reference, given)
+    unknowns, weight, losses = search.unknowns(), given, []
+    noise = jnp.full(2, jnp.inf, reference.dtype)
+    is_last = not is_robust
+    end = End(unknowns, [], verdict(optx.RESULTS.successful))
+    found = _shown(search, unknowns, reference, jnp.sqrt(given)[..., None])
+    if is_robust:  # What is far off at the start, a lamp in the picture, has no say from then.
+        noise, weight = _reweighted(model, found, reference, given, noise, unit)
+    for left in reversed(range(_REWEIGHTINGS)):
+        root = jnp.sqrt(weight)[..., None]
+        is_last = is_last or left == 0
+        residual = Residual(search, reference, unit, root)
+        if any(unknowns):
+            end = descend_on(residual, unknowns, **({} if is_last else _LOOSE))
+        else:
+            end = end._replace(losses=[_mean_square(residual, unknowns)])
+        unknowns = end.unknowns
+        losses += end.losses
+        found = _shown(search, unknowns, reference, root)
+        if is_last or end.result != optx.RESULTS.successful:
+            break
+        noise, again = _reweighted(model, found, reference, given, noise, unit)
+        is_last = bool(jnp.max(jnp.abs(again - weight)) < _SETTLED * jnp.max(given))
+        weight = again
+    square = unit.astype(float) ** 2
+    end = End(tuple(found), [loss * square for loss in losses], end.result)
+    return end, weight, noise
+
+
+@eqx.filter_jit
+def _mean_square(residual, unknowns):
+    return jnp.mean(residual(unknowns) ** 2)
+
+
+@eqx.filter_jit
+def _reweighted(model, lights, reference, given, last, unit):
+    """The noise, which seems to fall by at most a half, and what pixels count with it."""
+    length = lengths(model(lights) - reference, given)
+    is_reached = jnp.any(model.basis(lights) != 0, axis=(0, 3))
+    told = noise_of(length, jnp.where(is_reached, given, 0))
+    least = jnp.minimum(last, jnp.max(length, axis=(1, 2)) / CUT) / _EASE
+    noise = jnp.maximum(jnp.maximum(told, least), LEAST_NOISE * unit)
+    return noise, given * biweight(length, noise)
+
+
+def _shown(search, unknowns, reference, root):
+    """The lights of some unknowns, with their best colours where those are fitted."""
+    lights = _moved(search, unknowns)
+    if "color" not in search.model.names:
+        return lights
+    return _colored(lights, best_colors(_basis(search.model, lights), reference, root))
+
+
+def _colored(lights: Sequence[Any], colors: np.ndarray) -> list[Any]:
+    return [
+        eqx.tree_at(lambda light: light.color, light, color)
+        for light, color in zip(lights, jnp.asarray(colors.T, float), strict=True)
+    ]
+
+
+def _say_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None:
+    """Log what of the lights changes nothing in the image; `ValueError` if all of it does."""
+    values = [model.values(light) for light in lights]
+    # Colours that are fitted are found whatever they were.
+    white = lambda light, own: with_values(
+        light, {"color": jnp.ones(3)} if "color" in own else {}
+    )
+    columns = linearized(model, tuple(map(white, lights, values)))[1]
+    is_moving = np.asarray(jnp.any(columns != 0, axis=0)).tolist()
+    moving, fixed = [], []
+    for index, own in enumerate(values):
+        for name, value in own.items():
+            numbers, is_moving = is_moving[: len(value)], is_moving[len(value) :]
+            (moving if any(numbers) else fixed).append(f"{name} of light {index}")
+    names = ", ".join(fixed)
+    if not moving:
+        raise ValueError(
+            "`lights(lights)` must start where something that is fitted changes the image, "
+            f"got no derivative in {names}."
+        )
+    if fixed:
+        _logger.warning("`lights` can't move %s, which changes nothing at the start.", names)
+
+
+@eqx.filter_jit
+def _moved(search, unknowns):
+    return search.lights(unknowns)
+
+
+@eqx.filter_jit
+def _basis(model, lights):
+    return model.basis(lights)
