@@ -25,9 +25,10 @@ GAMMAS, EPSILONS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0), (0.5, 1.0, 2.0, 4.0, 8.0, 16.
 class Case:
     """Views of a scene: a pinhole picture, what is behind it, and references through lenses."""
 
-    def __init__(self, mesh, side, samples):
-        self.mesh, self.side, self.samples = mesh, side, samples
-        self.camera = scene.default_camera(mesh, height=side, width=side)
+    def __init__(self, mesh, size, samples):
+        self.mesh, self.samples = mesh, samples
+        self.size = {"height": size[0], "width": size[1]}
+        self.camera = scene.default_camera(mesh, **self.size)
         self.lights = scene.default_lights(self.camera)
         self.shade = jax.jit(relight.render)
         _, self.depth = self.layer(self.camera)
@@ -36,7 +37,7 @@ class Case:
         self.image = self.through(self.lens(0.0, 1.0), 16)
 
     def layer(self, eye, layer=0):
-        seen = scene.gbuffer(self.mesh, eye, height=self.side, width=self.side, layer=layer)
+        seen = scene.gbuffer(self.mesh, eye, **self.size, layer=layer)
         return self.shade(seen, eye, self.lights), seen.depth
 
     def lens(self, aperture, focus):
@@ -96,7 +97,7 @@ def main():
     for path in given.meshes or [None]:
         mesh = scene.still_life() if path is None else scene.load(path)
         title = "still life" if path is None else path.rpartition("/")[2]
-        for name, largest, figures in rows(Case(mesh, given.side, given.samples)):
+        for name, largest, figures in rows(Case(mesh, (given.side, given.side), given.samples)):
             scattered, (one, two) = figures[0], figures[1:] - figures[0]
             found.append([*one, *two, two[0] - one[0]])
             print(

@@ -42,7 +42,7 @@ _WITHIN, _LEAST_NOISE = 0.68, 1e-3
 _NUDGE = 0.03
 
 # Strata of circles of confusion, of pixels with one noise.
-_BINS = 6
+BINS = 6
 
 # Up to this circle of confusion, in pixels, a sprite's second moment is not its disc's.
 _SMALL_COC = 8.0
@@ -157,8 +157,8 @@ class Model(eqx.Module):
         def draw(aperture, focus, focal):
             lens, image = ThinLens(aperture, focus, focal), self.pictures.image
             if self.method == "scatter":
-                amplified = {name: values[name] for name in ("gamma", "epsilon")}
-                drawn = scatter(image, depth, lens, max_coc=self.max_coc, **amplified)
+                gamma, epsilon, room = values["gamma"], values["epsilon"], self.max_coc
+                drawn = scatter(image, depth, lens, gamma=gamma, epsilon=epsilon, max_coc=room)
             else:
                 layers = {"behind": behind, "threshold": values["threshold"]}
                 drawn = layered(image, depth, lens, max_coc=self.max_coc, **layers)
@@ -167,10 +167,11 @@ class Model(eqx.Module):
             coc = jnp.where(depth > 0, lens.circle_of_confusion(depth), 0)
             return drawn + values["footprint"] * _missing_blur(drawn, coc)
 
-        lenses = *(values[name] for name in LENS), self.pictures.focal_pixels
-        if self.pictures.focal_pixels.size == 1:
-            return draw(*(part[0] for part in lenses))[None]
-        return jax.vmap(draw)(*lenses)
+        focal = self.pictures.focal_pixels
+        apertures, foci = (values[name] for name in LENS)
+        if focal.size == 1:
+            return draw(apertures[0], foci[0], focal[0])[None]
+        return jax.vmap(draw)(apertures, foci, focal)
 
 
 def _missing_blur(
@@ -353,12 +354,11 @@ def strata(
     circles: Float[Array, "picture height width"],
     scale: Float[Array, "picture height width"],
     channels: int,
-    bins: int = _BINS,
+    bins: int = BINS,
 ) -> Int[Array, " residual"]:
     """For each residual its stratum out of `2 * bins`: pixels with like circles and like noise.
 
-    What a method gets wrong depends on these two. A stratum holds as many pixels as any other of
-    its noise.
+    What a method gets wrong depends on these two. Strata of one noise have one size.
     """
     is_noisy = (scale > jnp.min(scale)).reshape(-1)
     order = jnp.argsort(jnp.argsort(circles.reshape(-1) + is_noisy * 2 * jnp.max(circles)))

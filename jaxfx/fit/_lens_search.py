@@ -75,7 +75,8 @@ class Search(NamedTuple):
         if self.is_robust:
             ends[0] = self._refine(residual, ends[0].unknowns, apart=True)
             losses += ends[0].losses
-        residual, end, more = self._finish(model, ends[0].unknowns)
+        full = small if shrink == 1 else model
+        residual, end, more = self._finish(full, ends[0].unknowns)
         told = tuple(
             small.values(end.unknowns) | {"loss": jnp.asarray(end.losses[-1])} for end in ends
         )
@@ -92,7 +93,9 @@ class Search(NamedTuple):
         losses = []
         if self.is_robust:
             model = dataclasses.replace(model, corrects=jnp.ones_like(model.corrects))
-        for _ in range(_ROUNDS):
+        rounds = 0
+        while True:
+            rounds += 1
             model = self._with_room(model, model.values(unknowns), _ROOM)
             residual = self.residual(model)
             if self.is_robust:
@@ -102,18 +105,20 @@ class Search(NamedTuple):
             end = self.solve(residual, unknowns)
             unknowns, losses = end.unknowns, losses + end.losses
             circles = model.circles(model.values(unknowns))
-            if self.max_coc is not None or not bool((circles > model.max_coc).any()):
-                break
-        return residual, end, losses
+            has_room = self.max_coc is not None or not bool((circles > model.max_coc).any())
+            if has_room or rounds == _ROUNDS:
+                return residual, end, losses
 
     def _with_room(self, model: Model, values: Values, room: float, shrink: int = 1) -> Model:
-        """The model that draws circles so much larger than those of these values."""
+        """The model that draws circles so much larger than those of these values, at least."""
         if self.max_coc is not None:
             return dataclasses.replace(model, max_coc=self.max_coc / shrink)
         depth, _ = model.depths(values)
         number = len(model.pictures.references)
         lenses = [model.lens(values, picture) for picture in range(number)]
         largest = max(largest_coc("dof", depth, lens) for lens in lenses)
+        if room * largest <= model.max_coc:
+            return model
         # Two steps an octave: searches from near-by starts share their programs.
         octaves = math.ceil(2 * math.log2(room * largest)) / 2
         return dataclasses.replace(model, max_coc=2.0**octaves)

@@ -82,7 +82,7 @@ class Residual(eqx.Module):
         shown = bilinear(views.image, view.pixels).reshape(*size, -1)
         reference = self._thinned(views.reference)
         scale = self.scale.astype(shown.dtype)
-        gain, offset = _exposure(shown, reference, counts, scale[0], self.exposure)
+        gain, offset = exposure_between(shown, reference, counts, scale[0], self.exposure)
         differences = [(gain * shown + offset - reference) / scale[0]]
         if views.reference_depth is not None:
             own = self._thinned(views.reference_depth)
@@ -122,7 +122,7 @@ class Comparison(NamedTuple):
     contrast: Float[Array, ""]
 
 
-def _exposure(
+def exposure_between(
     shown: Array, reference: Array, counts: Array, scale: Array, is_free: bool
 ) -> tuple[Array, Array]:
     """For each channel the gain and the offset that bring what is shown to the reference.

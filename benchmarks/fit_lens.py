@@ -1,0 +1,92 @@
+"""What `fit.dof` finds of a lens, for `docs/fits.md`: how far off, what it states, seconds.
+
+`python -m benchmarks.fit_lens [MESH ...]` fits multi-pass pictures of 320 x 240 pixels of every
+scene, the still life if none is given, at three foci and two apertures, from starts that are
+30 % (aperture) and 15 % (focus) off, either way. A row holds medians, the worst in brackets,
+of a method; `--each` prints every fit.
+"""
+
+import argparse
+import itertools
+import time
+
+import jax
+import numpy as np
+
+from benchmarks.layered_quality import FOCI, LARGEST, Case
+from jaxfx import ThinLens, fit, scene
+
+
+SIZE = (240, 320)
+STARTS = (1.3, 1.15), (0.7, 0.85)
+FREE = ("aperture", "focus_distance")
+METHODS = {
+    "scatter": {"parameters": FREE, "gamma": 0.0},
+    "layered": {"method": "layered", "parameters": FREE},
+    "layered, second layer": {"method": "layered", "parameters": FREE},
+    "scatter, squares": {"parameters": FREE, "gamma": 0.0, "loss": "squares"},
+}
+
+
+def fits(case, name, options):
+    """Of every focus, aperture and start: the case, misses and errors as ratios, seconds."""
+    if name.endswith("second layer"):
+        options = options | {"behind": case.behind}
+    for (place, share), largest in itertools.product(FOCI.items(), LARGEST):
+        lens, reference = case.focused(share, largest)
+        for aperture, focus in STARTS:
+            start = ThinLens(
+                lens.aperture * aperture, lens.focus_distance * focus, lens.focal_pixels
+            )
+            begin = time.perf_counter()
+            given = reference, case.image, case.depth, start
+            found = jax.block_until_ready(fit.dof(*given, throw=False, **options))
+            took = time.perf_counter() - begin
+            truth = np.array([float(getattr(lens, each)) for each in FREE])
+            miss = np.array([float(getattr(found.lens, each)) for each in FREE]) / truth - 1
+            stated = np.array([float(found.uncertainty[each]) for each in FREE]) / truth
+            yield f"{place}, {largest} pixels", miss, stated, took, found.success
+
+
+def main():
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("meshes", nargs="*", metavar="MESH", help="files that trimesh reads")
+    parser.add_argument("--samples", type=int, default=256, help="passes of a reference")
+    parser.add_argument("--each", action="store_true", help="print every fit")
+    given = parser.parse_args()
+    paths = given.meshes or [None]
+    meshes = [scene.still_life() if path is None else scene.load(path) for path in paths]
+    cases = [Case(mesh, SIZE, given.samples) for mesh in meshes]
+    print("| method | aperture off, % | focus off, % | stated, % | within 1.96 | s | success |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    for name, options in METHODS.items():
+        rows = []
+        for path, case in zip(paths, cases, strict=True):
+            for place, *row in fits(case, name, options):
+                rows.append(row)
+                if given.each:
+                    miss, stated, took, success = row
+                    print(
+                        name,
+                        path or "still life",
+                        place,
+                        100 * miss,
+                        100 * stated,
+                        took,
+                        success,
+                    )
+        miss, stated, took, success = (np.array(column) for column in zip(*rows, strict=True))
+        off = 100 * np.abs(miss)
+        shown = [f"{np.median(off[:, i]):.1f} ({off[:, i].max():.1f})" for i in range(2)]
+        errors = ", ".join(f"{100 * np.median(stated[:, i]):.1f}" for i in range(2))
+        held = (np.abs(miss) < 1.96 * stated).mean(axis=0)
+        print(
+            f"| {name} | {shown[0]} | {shown[1]} | {errors} | "
+            f"{100 * held[0]:.0f} %, {100 * held[1]:.0f} % | "
+            f"{np.median(took):.1f} ({np.max(took):.1f}) | {success.sum()} of {len(rows)} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""The arguments of `fit.dof`, read and checked."""
+
+import math
+from collections.abc import Collection
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
+
+from jaxfx._arguments import check_lens
+from jaxfx._checks import check, check_depth, check_image, parameter
+from jaxfx.dof._sprites import POINT_RADIUS
+from jaxfx.fit._lens import DISPARITY, LENS, Method, Pictures, Values
+from jaxfx.lens import ThinLens
+
+
+# What is sought by default.
+PARAMETERS = {"scatter": (*LENS, "gamma", "epsilon"), "layered": (*LENS, "threshold")}
+
+
+def read_pictures(
+    reference: Any, image: Any, depth: Any, lens: Any, behind: Any, weights: Any
+) -> tuple[Pictures, tuple[ThinLens, ...]]:
+    """The pictures, checked, in the type of `image`, and their lenses."""
+    image = check_image("dof(image)", image)
+    depth = check_depth("dof(depth)", depth, image.shape[:2])
+    several = isinstance(reference, list | tuple)
+    given = [*reference] if several else [reference]
+    names = (
+        [f"dof(reference[{at}])" for at in range(len(given))] if several else ["dof(reference)"]
+    )
+    references = [check_image(name, each) for name, each in zip(names, given, strict=True)]
+    for name, each in zip(names, references, strict=True):
+        if each.shape != image.shape:
+            raise ValueError(
+                f"`{name}` must have the image's shape {image.shape}, got {each.shape}."
+            )
+        check(name, each, np.isfinite, "finite")
+    check("dof(image)", image, np.isfinite, "finite")
+    check("dof(depth)", depth, lambda v: (v > 0).any(), "known somewhere")
+    lenses = tuple(lens) if isinstance(lens, list | tuple) else (lens,)
+    for each in lenses:
+        if not isinstance(each, ThinLens):
+            raise ValueError(f"`dof(lens)` must be a ThinLens, got {type(each).__name__}.")
+        check_lens("dof(lens)", each)
+        check(
+            "dof(lens.aperture)", each.aperture, lambda v: v > 0, "positive to start a search"
+        )
+    if len(lenses) != len(references) or not references:
+        raise ValueError(
+            f"`dof(lens)` must be one for each of {len(references)} pictures, "
+            f"got {len(lenses)}."
+        )
+    if behind is not None:
+        hidden = check_image("dof(behind=...)[0]", behind[0]).astype(image.dtype)
+        behind = hidden, check_depth("dof(behind=...)[1]", behind[1], depth.shape)
+    focal = jnp.stack([each.focal_pixels.astype(image.dtype) for each in lenses])
+    stacked = jnp.stack([each.astype(image.dtype) for each in references])
+    pictures = Pictures(stacked, image, depth, behind, _weights(weights, image), focal)
+    return pictures, lenses
+
+
+def _weights(weights: Any, image: Array) -> Float[Array, "height width"]:
+    """The weight of each pixel, in the type of `image`."""
+    if weights is None:
+        return jnp.ones(image.shape[:2], image.dtype)
+    weights = check_depth("dof(weights=...)", weights, image.shape[:2])
+    is_weight = lambda v: (np.isfinite(v) & (v >= 0)).all() and (v > 0).any()
+    check("dof(weights=...)", weights, is_weight, "finite, 0 or positive, and not all 0")
+    return weights.astype(image.dtype)
+
+
+def read_start(
+    lenses: tuple[ThinLens, ...], gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
+) -> Values:
+    """All parameters where the search starts, checked, in one type."""
+    numbers = {
+        "gamma": parameter("dof(gamma=...)", gamma),
+        "epsilon": parameter("dof(epsilon=...)", epsilon),
+        "threshold": parameter("dof(threshold=...)", threshold),
+    }
+    for name, value in numbers.items():
+        check(f"dof({name}=...)", value, lambda v: v >= 0, "0 or positive")
+    start = {name: jnp.stack([getattr(lens, name) for lens in lenses]) for name in LENS}
+    start |= numbers | {"scale": jnp.ones(()), "shift": jnp.zeros(())}
+    return {name: value.astype(dtype) for name, value in start.items()} | {
+        "footprint": jnp.zeros((), dtype)
+    }
+
+
+def check_moves(
+    names: Collection[str], lenses: tuple[ThinLens, ...], pictures: Pictures, max_coc: Any
+) -> None:
+    """`ValueError` for a lens to be found of which no circle of confusion has a derivative."""
+    if not set(LENS).intersection(names):
+        return
+    depths = [pictures.depth] + ([] if pictures.behind is None else [pictures.behind[1]])
+    most = math.inf if max_coc is None else max_coc
+    for lens in lenses:
+        circles = [jnp.where(d > 0, lens.circle_of_confusion(d), jnp.nan) for d in depths]
+        circles = jnp.stack(circles)
+        # What is no diameter at all is named by the method.
+        if most <= 0 or bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
+            continue
+        least, largest = (float(each(circles)) for each in (jnp.nanmin, jnp.nanmax))
+        raise ValueError(
+            "`dof(lens)` must start with a circle of confusion between a pixel and `max_coc` "
+            "somewhere, for no other has a derivative that could move the aperture or the "
+            f"focus distance, got circles from {least:.3g} to {largest:.3g} pixels and "
+            f"`max_coc` {max_coc}."
+        )
+
+
+def read_names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]:
+    usual = PARAMETERS[method]
+    known = usual + DISPARITY
+    names = tuple(n for n in known if n in (usual if parameters is None else parameters))
+    if not names or (parameters is not None and len(names) != len(parameters)):
+        raise ValueError(
+            f"`dof(parameters=...)` must name some of {known}, got {tuple(parameters or ())}."
+        )
+    return names
+
+
+def read_ratios(ratios: Any) -> tuple[str, ...]:
+    names = tuple(name for name in LENS if name in ratios)
+    if len(names) != len(tuple(ratios)):
+        raise ValueError(f"`dof(ratios=...)` must name some of {LENS}, got {tuple(ratios)}.")
+    return names
