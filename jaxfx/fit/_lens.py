@@ -361,12 +361,13 @@ def strata(
     What a method gets wrong depends on these two. Strata of one noise have one size.
     """
     is_noisy = (scale > jnp.min(scale)).reshape(-1)
-    order = jnp.argsort(jnp.argsort(circles.reshape(-1) + is_noisy * 2 * jnp.max(circles)))
+    circles = circles.reshape(-1)
+    place = jnp.argsort(jnp.argsort(circles + jnp.where(is_noisy, 2 * jnp.max(circles), 0)))
     quiet = jnp.sum(~is_noisy)
-    rank = jnp.where(is_noisy, order - quiet, order)
-    size = jnp.where(is_noisy, is_noisy.size - quiet, quiet)
-    bin_ = jnp.minimum(rank * bins // jnp.maximum(size, 1), bins - 1)
-    return jnp.repeat(bin_ + bins * is_noisy, channels)
+    rank = jnp.where(is_noisy, place - quiet, place)
+    size = jnp.maximum(jnp.where(is_noisy, is_noisy.size - quiet, quiet), 1)
+    stratum = jnp.minimum(rank * bins // size, bins - 1) + jnp.where(is_noisy, bins, 0)
+    return jnp.repeat(stratum, channels)
 
 
 @eqx.filter_jit

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +10,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_lens
-from jaxfx._checks import check, check_depth, check_image, parameter
+from jaxfx._checks import check, check_depth, check_image, option, parameter
 from jaxfx.dof._sprites import POINT_RADIUS
-from jaxfx.fit._lens import DISPARITY, LENS, Method, Pictures, Values
+from jaxfx.fit._lens import DISPARITY, LENS, Method, Pictures, Tone, Values
 from jaxfx.lens import ThinLens
 
 
@@ -20,13 +20,24 @@ from jaxfx.lens import ThinLens
 PARAMETERS = {"scatter": (*LENS, "gamma", "epsilon"), "layered": (*LENS, "threshold")}
 
 
-def read_pictures(
+Loss = Literal["robust", "squares"]
+Exposure = Literal["free", "equal"]
+_OPTIONS = {"method": Method, "loss": Loss, "tone": Tone, "exposure": Exposure}
+
+
+def options(**given: Any) -> None:
+    """`ValueError` for a choice that is none."""
+    for name, value in given.items():
+        option(f"dof({name}=...)", value, get_args(_OPTIONS[name]))
+
+
+def pictures(
     reference: Any, image: Any, depth: Any, lens: Any, behind: Any, weights: Any
 ) -> tuple[Pictures, tuple[ThinLens, ...]]:
     """The pictures, checked, in the type of `image`, and their lenses."""
     image = check_image("dof(image)", image)
     depth = check_depth("dof(depth)", depth, image.shape[:2])
-    several = isinstance(reference, list | tuple)
+    several = isinstance(reference, list | tuple) and all(np.ndim(x) == 3 for x in reference)
     given = [*reference] if several else [reference]
     names = (
         [f"dof(reference[{at}])" for at in range(len(given))] if several else ["dof(reference)"]
@@ -72,7 +83,7 @@ def _weights(weights: Any, image: Array) -> Float[Array, "height width"]:
     return weights.astype(image.dtype)
 
 
-def read_start(
+def start(
     lenses: tuple[ThinLens, ...], gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
 ) -> Values:
     """All parameters where the search starts, checked, in one type."""
@@ -113,7 +124,7 @@ def check_moves(
         )
 
 
-def read_names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]:
+def names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]:
     usual = PARAMETERS[method]
     known = usual + DISPARITY
     names = tuple(n for n in known if n in (usual if parameters is None else parameters))
@@ -124,7 +135,7 @@ def read_names(method: Method, parameters: Collection[str] | None) -> tuple[str,
     return names
 
 
-def read_ratios(ratios: Any) -> tuple[str, ...]:
+def ratios(ratios: Any) -> tuple[str, ...]:
     names = tuple(name for name in LENS if name in ratios)
     if len(names) != len(tuple(ratios)):
         raise ValueError(f"`dof(ratios=...)` must name some of {LENS}, got {tuple(ratios)}.")

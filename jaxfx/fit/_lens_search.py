@@ -22,7 +22,7 @@ _TRIED = {
     "focus_distance": (0.7, 0.8, 0.9, 1.0, 1.12, 1.25, 1.43),
 }
 _SEARCHES = 2
-_EPSILON_RESTARTS = (2.0, 0.5)
+_SOFT, _RESTARTS = ("epsilon", "threshold"), (2.0, 0.5)
 
 # The largest side of the pictures on which searches begin, in pixels, and what the largest
 # circle of confusion must keep there: smaller ones tell no lens.
@@ -65,10 +65,10 @@ class Search(NamedTuple):
         losses, ends = [jnp.mean(residual.weighted(evaluate(residual, still)[0]) ** 2)], []
         for unknowns in tried:
             ends.append(self._refine(residual, unknowns))
-        if "epsilon" in model.names:
+        for name in (name for name in _SOFT if name in model.names):
             best = _best(residual, ends)[0].unknowns
-            for factor in _EPSILON_RESTARTS:
-                moved = best | {"epsilon": best["epsilon"] + math.log(factor)}
+            for factor in _RESTARTS:
+                moved = best | {name: best[name] + math.log(factor)}
                 ends.append(self._refine(residual, moved))
         losses += [loss for end in ends for loss in end.losses]
         ends = _best(residual, ends)

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Collection, Sequence
-from typing import Literal, final, get_args
+from typing import final
 
 import equinox as eqx
 import jax
@@ -18,11 +18,10 @@ from jaxfx._checks import (
     Number,
     WholeNumber,
     number,
-    option,
     whole_number,
 )
 from jaxfx._progress import Bar
-from jaxfx.fit import _lens_arguments as _arguments
+from jaxfx.fit import _lens_arguments as read
 from jaxfx.fit._descent import End, Solver, covariance, descend, tiles
 from jaxfx.fit._lens import (
     BINS,
@@ -41,15 +40,12 @@ from jaxfx.fit._lens_search import Search
 from jaxfx.lens import ThinLens
 
 
-PARAMETERS, LAYERED_PARAMETERS = _arguments.PARAMETERS.values()
+PARAMETERS, LAYERED_PARAMETERS = read.PARAMETERS.values()
 DISPARITY_PARAMETERS = DISPARITY
 
 # A lens is told if its parameters' standard errors are below this share of them, and if so much
 # of the contrast is explained.
 _MOST_ERROR, _LEAST_EXPLAINED = 0.5, 0.5
-
-Loss = Literal["robust", "squares"]
-Exposure = Literal["free", "equal"]
 
 
 @final
@@ -67,8 +63,8 @@ class DofFit(eqx.Module):
       offset.
     - `losses`: the mean squared residual at the start and after every step, in squared units
       of radiance; it jumps where the search goes on with other lenses, sizes or weights.
-    - `ends`: where the searches on small pictures ended, the best first: the parameters and
-      the `"loss"` of each.
+    - `ends`: where the searches on small pictures ended, the best first: the parameters, in
+      their units, and the `"loss"` of each.
     - `uncertainty`: a standard error for each fitted parameter, in its own unit, one for each
       picture where the parameter has one. It takes the residuals of 8 x 8 tiles of the image
       for independent of one another, and no others. A parameter that the pictures do not tell
@@ -103,7 +99,7 @@ class DofFit(eqx.Module):
 
     @property
     def image(self) -> Float[Array, "height width channel"]:
-        """The first picture."""
+        """The first of the pictures, height width channel."""
         return self.images[0]
 
     @property
@@ -155,9 +151,9 @@ def dof(
     | None = None,
     max_coc: Number | None = None,
     weights: Num[ArrayLike, "height width"] | None = None,
-    loss: Loss = "robust",
+    loss: read.Loss = "robust",
     tone: Tone = "linear",
-    exposure: Exposure = "equal",
+    exposure: read.Exposure = "equal",
     solver: Solver | None = None,
     parameters: Collection[str] | None = None,
     ratios: Collection[str] = (),
@@ -168,51 +164,43 @@ def dof(
     """The lens and the other parameters that make a method look most like a photograph.
 
     Photographs show what one image does not hold: surfaces that near ones hide, and highlights.
-    So the loss is Huber's, and pixels that a sprite from an edge in depth reaches count by the
-    noise that they have, which is estimated apart from that of all others.
-
-    First, lenses of half to twice the aperture and 0.7 to 1.4 times the focus distance are
-    tried on pictures of at most 160 pixels a side. From the best two, and of `"scatter"` from
-    half and twice the epsilon, a search goes on there; the best end is refined on the pictures
-    as given.
+    So the loss is Huber's, and pixels that a sprite from an edge in depth or of the frame
+    reaches count by a noise of their own. First, lenses of half to twice the aperture and 0.7
+    to 1.4 times the focus distance are tried on pictures of at most 160 pixels a side. From the
+    best two, and from half and twice the epsilon or the threshold, a search goes on there; the
+    best end is refined on the pictures as given.
 
     **Arguments:**
 
     - `reference`: height width channel, linear radiance: a photograph or a multi-pass picture;
-      or several of one scene.
+      or a list of several of one scene.
     - `image`, `depth`: height width channel and height width, as in the method.
     - `lens`: where the search starts, lengths in scene units, one for each picture;
       `focal_pixels` is never fitted.
-    - `gamma`, `epsilon`: where the search starts, no unit and pixels; of `"scatter"`.
+    - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `method`: the one of `jaxfx.dof` whose parameters are sought.
-    - `threshold`, `behind`: where the search starts, in pixels, and the second layer, as in
-      `dof.layered`; of `"layered"`.
-    - `max_coc`: static; the largest diameter, in pixels, that the search may draw. By default
-      a quarter more than the largest so far, and larger wherever that proves too small.
+    - `behind`: the second layer, as in `dof.layered`.
+    - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
     - `loss`: `"robust"`, or `"squares"`: all pixels alike, and the footprint is held at 0.
-    - `tone`: `"linear"`, or `"log"`: radiances are compared by their logarithms, far above
-      the reference's mean, and as they are far below.
-    - `exposure`: `"equal"`, or `"free"` where gain and offset of each channel and picture are
-      those that fit best.
+    - `tone`: `"linear"`, or `"log"` for what is far above the reference's mean.
+    - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where its steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.PARAMETERS` or, of `"layered"`, out of
-      `fit.LAYERED_PARAMETERS`, and of `fit.DISPARITY_PARAMETERS`: the inverse depth is
-      `scale` times the given one plus `shift`. The others stay as given. By default all but
-      scale and shift: with a lens that is free too, one picture does not tell them.
-    - `ratios`: those of the lens's parameters whose ratios between the pictures are known to
-      be the starts'.
+      `fit.LAYERED_PARAMETERS`, which are the default, and of `fit.DISPARITY_PARAMETERS`: the
+      inverse depth is `scale` times the given one plus `shift`.
+    - `ratios`: those of the lenses' parameters whose ratios are known to be the starts'.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the fit is no success; else `doubt` says why.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `DofFit`.
 
-    **Raises:** `ValueError` for what the method refuses, for shapes that differ, an unknown
-    or empty choice of parameters, a lens to start from that can't move (a zero aperture; all
-    circles of confusion below a pixel or above `max_coc`), or a picture that is not finite.
+    **Raises:** `ValueError` for what the method refuses, shapes that differ, an unknown or
+    empty choice of parameters, a start that can't move (a zero aperture; all circles of
+    confusion below a pixel or above `max_coc`), or a picture that is not finite.
     `RuntimeError` where the fit is no success and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
@@ -220,34 +208,35 @@ def dof(
     Source: Huber 1964, the loss; Golub & Pereyra 1973, exposure by variable projection. The
     noise near edges, the footprint and the lenses that are tried are our own.
     """
-    pictures, lenses = _arguments.read_pictures(reference, image, depth, lens, behind, weights)
-    option("dof(method=...)", method, get_args(Method))
-    option("dof(loss=...)", loss, get_args(Loss))
-    option("dof(tone=...)", tone, get_args(Tone))
-    option("dof(exposure=...)", exposure, get_args(Exposure))
-    start = _arguments.read_start(lenses, gamma, epsilon, threshold, pictures.image.dtype)
-    names = _arguments.read_names(method, parameters)
-    ratios = _arguments.read_ratios(ratios)
+    pictures, lenses = read.pictures(reference, image, depth, lens, behind, weights)
+    read.options(method=method, loss=loss, tone=tone, exposure=exposure)
     max_steps = whole_number("dof(max_steps=...)", max_steps)
+    start = read.start(lenses, gamma, epsilon, threshold, pictures.image.dtype)
+    names = read.names(method, parameters)
     if max_coc is not None:
         max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
-    _arguments.check_moves(names, lenses, pictures, max_coc)
-    corrects = loss == "robust" and set(LENS + DISPARITY).intersection(names)
-    searched = (*names, "footprint") if corrects else names
-    model = Model(pictures, start, jnp.zeros(()), searched, method, 1.0)
-    make = lambda model: plain(model, exposure == "free", tone)
+    read.check_moves(names, lenses, pictures, max_coc)
+    is_robust, is_free = loss == "robust", exposure == "free"
+    if is_robust and {*LENS, *DISPARITY}.intersection(names):
+        names = (*names, "footprint")
+    model = Model(pictures, start, jnp.zeros(()), names, method, 1.0)
     with Bar(progress, "fit") as bar:
         solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
-        search = Search(make, solve, loss == "robust", max_coc, ratios)
-        residual, end, ends = search.run(model)
-    fitted = _fitted(residual, end, ends)
-    if throw and not fitted.success:
-        raise RuntimeError(
-            f"`dof` found no lens in {len(end.losses)} steps, the mean squared residual going "
-            f"from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {fitted.doubt} "
-            "`throw=False` returns what was reached."
-        )
-    return fitted
+        residual = functools.partial(plain, exposure=is_free, tone=tone)
+        search = Search(residual, solve, is_robust, max_coc, read.ratios(ratios))
+        fitted = _fitted(*search.run(model))
+    return _checked(fitted) if throw else fitted
+
+
+def _checked(fitted: DofFit) -> DofFit:
+    """The fit, or a `RuntimeError` where it is no success."""
+    if fitted.success:
+        return fitted
+    raise RuntimeError(
+        f"`dof` found no lens in {len(fitted.losses)} steps, the mean squared residual going "
+        f"from {fitted.losses[0]:.3g} to {fitted.losses[-1]:.3g}: {fitted.doubt} "
+        "`throw=False` returns what was reached."
+    )
 
 
 def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) -> DofFit:

@@ -90,19 +90,18 @@ def test_recovers_what_made_the_picture(sides, dtype):
 
 
 @pytest.mark.full
-def test_the_threshold_of_layered_scatter_is_found():
-    image, depth = still_life(16)
-    lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 40.0)
-    draw = functools.partial(dof.layered, image, depth, max_coc=4.0)
-    fitted = fit.dof(
-        *(draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)),
-        method="layered",
-        threshold=2.0,
-        max_coc=4.0,
-        progress=False,
-    )
-    values = fitted.lens.aperture, fitted.lens.focus_distance, fitted.threshold
-    np.testing.assert_allclose(values, (0.12, 3.0, 1.2), rtol=0.01)
+@pytest.mark.parametrize("loss", ["robust", "squares"])
+def test_the_threshold_of_layered_scatter_is_found(loss):
+    image, depth = still_life(32)
+    lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 80.0)
+    draw = functools.partial(dof.layered, image, depth, max_coc=8.0)
+    given = draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)
+    options = {"method": "layered", "threshold": 2.0, "max_coc": 8.0, "loss": loss}
+    fitted = fit.dof(*given, **options)
+    values = fitted.lens.aperture, fitted.lens.focus_distance
+    np.testing.assert_allclose(values, (0.12, 3.0), rtol=1e-3)
+    # Robustly it is known to a few parts in ten: it makes a difference only beside edges.
+    assert fitted.threshold == pytest.approx(1.2, rel=1e-3 if loss == "squares" else 0.2)
     assert set(fitted.uncertainty) == set(fit.LAYERED_PARAMETERS)
 
 
@@ -237,8 +236,9 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
             [(values[name] - TRUTH[name]) / fitted.uncertainty[name] for name in TRUTH]
         )
     # By the median: one draw in eight makes epsilon's other minimum, at 1.4, the lower one.
+    # What is stated allows for a wrong model: it is larger than what noise alone makes.
     spread = np.median(np.abs(misses), axis=0) / 0.6745
-    assert ((spread > 0.5) & (spread < 2)).all(), spread
+    assert ((spread > 0.25) & (spread < 1.5)).all(), spread
 
 
 @pytest.mark.full
@@ -276,7 +276,7 @@ FAULTS = {
     "dof(weights=...) must be finite": {"weights": np.zeros((SIZE, SIZE))},
     "dof(parameters=...)": {"parameters": ("aperture", "focal_pixels")},
     "dof(parameters=...) must name some": {"parameters": ()},
-    "dof(parameters=...) must name some of ('aperture', 'focus_distance', 'threshold')": {
+    "dof(parameters=...) must name some of ('aperture', 'focus_distance', 'threshold',": {
         "method": "layered",
         "parameters": ("gamma",),
     },
@@ -382,8 +382,12 @@ def test_known_lenses_tell_scale_and_shift_of_disparity():
 @pytest.mark.full
 def test_one_picture_does_not_tell_a_lens_and_disparity_at_once():
     """The defocus is aperture x (1 / focus - scale / depth - shift): four numbers for two."""
+    _, image, depth = picture()
+    values = TRUTH | {"gamma": 0.0}
+    reference = dof.scatter(image, depth, **options(values), max_coc=8.0)
+    reference = reference + np.random.default_rng(0).normal(0, 0.01, image.shape)
     free = ("aperture", "focus_distance", *fit.DISPARITY_PARAMETERS)
-    fitted = quietly(*picture(), parameters=free, throw=False)
+    fitted = quietly(reference, image, depth, values, parameters=free, throw=False)
     assert not fitted.success and set(fitted.untold) >= {"aperture", "scale"}
 
 
