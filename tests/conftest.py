@@ -18,7 +18,7 @@ gc.set_threshold(100_000, 20, 20)
 MANY_MAPS = 20_000
 
 # Whole folders that only `--full` runs; single tests carry the marker `full`.
-FULL_FOLDERS = {"examples", "stability"}
+FULL_FOLDERS = {"accelerator", "examples", "stability"}
 
 # The file that takes longest is begun first, or one process would end with it alone.
 LONGEST = "test_transforms.py"

@@ -23,6 +23,7 @@ def both(call):
     return value_and_slopes
 
 
+@pytest.mark.full
 @each(CASES)
 def test_every_function_and_its_gradient_can_be_lowered_for_accelerators(case):
     call, arguments = case.split()
@@ -61,7 +62,7 @@ def case_of(transform):
     return (images, depths, LENS) if "batch" in transform else (*pictures[0], LENS)
 
 
-@first("transform", TRANSFORMS, 2)
+@first("transform", TRANSFORMS)
 @first("name", ["scatter", "depth_sorted"])
 def test_accelerators_compute_what_cpus_do(name, transform):
     call, data = TRANSFORMS[transform](METHODS[name]), case_of(transform)
