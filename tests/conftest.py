@@ -19,6 +19,8 @@ MANY_MAPS = 20_000
 
 # Whole folders that only `--full` runs; single tests carry the marker `full`.
 FULL_FOLDERS = {"accelerator", "examples", "stability"}
+# What runs tests of other folders again: of them, only those without the marker, unless named.
+AGAIN = "accelerator"
 
 # The file that takes longest is begun first, or one process would end with it alone.
 LONGEST = "test_transforms.py"
@@ -30,37 +32,42 @@ def pytest_addoption(parser):
     )
 
 
-def _asked(config):
-    """Whether a path belongs to this run: `--full` and `-m` take all, and so does its name."""
+def _named(config):
+    """Whether a path, or the folder that only `--full` runs, stands on the command line."""
     root = config.invocation_params.dir
     named = {(root / argument.partition("::")[0]).resolve() for argument in config.args}
-    everything = config.getoption("full") or config.getoption("markexpr")
 
-    def is_asked(path):
+    def is_named(path):
         folder = path if path.is_dir() else path.parent
-        in_folder = folder.name in FULL_FOLDERS and folder in named
-        return everything or path in named or in_folder
+        return path in named or (folder.name in FULL_FOLDERS and folder in named)
 
-    return is_asked
+    return is_named
+
+
+def _takes_all(config):
+    """Whether `--full` or a marker is asked for."""
+    return config.getoption("full") or bool(config.getoption("markexpr"))
 
 
 def pytest_ignore_collect(collection_path, config):
     """Import no folder that only `--full` runs, unless it or a file in it was named."""
     if collection_path.name not in FULL_FOLDERS:
         return None
-    is_asked = _asked(config)
-    return not any(map(is_asked, [collection_path, *collection_path.glob("*.py")])) or None
+    paths = [collection_path, *collection_path.glob("*.py")]
+    return not (_takes_all(config) or any(map(_named(config), paths))) or None
 
 
 def pytest_collection_modifyitems(config, items):
     """Leave out what only `--full` runs, unless its folder, its file or a marker was named."""
-    is_asked = _asked(config)
-    left_out = {
-        item
-        for item in items
-        if item.get_closest_marker("full") or item.path.parent.name in FULL_FOLDERS
-        if not is_asked(item.path)
-    }
+    is_named, takes_all = _named(config), _takes_all(config)
+
+    def is_left_out(item):
+        folder, marked = item.path.parent.name, bool(item.get_closest_marker("full"))
+        if is_named(item.path):
+            return False
+        return (folder == AGAIN and marked) if takes_all else marked or folder in FULL_FOLDERS
+
+    left_out = {item for item in items if is_left_out(item)}
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]

@@ -62,8 +62,10 @@ def case_of(transform):
     return (images, depths, LENS) if "batch" in transform else (*pictures[0], LENS)
 
 
-@first("transform", TRANSFORMS)
-@first("name", ["scatter", "depth_sorted"])
+@first(
+    ("name", "transform"),
+    [*((("scatter", transform)) for transform in TRANSFORMS), ("depth_sorted", "gradient")],
+)
 def test_accelerators_compute_what_cpus_do(name, transform):
     call, data = TRANSFORMS[transform](METHODS[name]), case_of(transform)
     expected = jax.jit(call)(*data)
