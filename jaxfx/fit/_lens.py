@@ -38,6 +38,11 @@ _STEP = 0.25
 # as a share of the reference's.
 _WITHIN, _LEAST_NOISE = 0.68, 1e-3
 
+# A pixel whose difference is so many standard deviations has no say until they are estimated
+# again: the loss of a lamp would hide what a step gains. Below some 5, pixels that tell the
+# lens are left out.
+_OUTLIER = 20.0
+
 # By how much an unknown moves, a ratio, to see which pixels tell it.
 _NUDGE = 0.03
 
@@ -218,7 +223,7 @@ class Residual(eqx.Module):
     """The pictures drawn less the references, by Huber's loss, as a function of the unknowns.
 
     - `scale`: the standard deviation of the difference per pixel, in units of radiance; inf
-      for plain squares.
+      where a pixel has no say, 1 for plain squares.
     - `unit`: that of pixels far from edges.
     """
 
@@ -309,16 +314,18 @@ def _noise(model, values, difference, told, apart):
     told = told * model.pictures.weights[None, ..., None]
     least = _LEAST_NOISE * jnp.std(model.pictures.references) + jnp.finfo(told.dtype).tiny
     noise = functools.partial(_quantile, jnp.abs(difference), least=least)
+    size = jnp.max(jnp.abs(difference), axis=-1)
+    kept = lambda scale: jnp.where(size > _OUTLIER * scale, jnp.inf, scale)
     if not apart:
         everywhere = noise(told)
-        return jnp.full(told.shape[:3], everywhere), everywhere
+        return kept(jnp.full(size.shape, everywhere)), everywhere
     reached = functools.partial(_near_edges, max_coc=model.max_coc)
     edges = jax.vmap(reached)(_defocus(model, values), model.circles(values))
     near = edges[..., None]
     away, beside = noise(jnp.where(near, 0, told)), noise(jnp.where(near, told, 0))
     # Where nothing is told away from edges, these are all that there is.
     away = jnp.where(jnp.any(~near & (told > 0)), away, beside)
-    return jnp.where(edges, jnp.maximum(beside, away), away), away
+    return kept(jnp.where(edges, jnp.maximum(beside, away), away)), away
 
 
 def _defocus(model: Model, values: Values) -> Float[Array, "picture height width"]:

@@ -34,7 +34,7 @@ _COARSE, _LEAST_COC = 160, 5.0
 _TRIED_ROOM, _ROOM, _ROUNDS = 2.0, 1.25, 4
 
 # A search whose end is but another's start has converged where a step gains less than this.
-_SOON = {"patience": 2, "gain": 1e-2}
+_SOON = {"patience": 2, "gain": 1e-3}
 
 
 class Search(NamedTuple):

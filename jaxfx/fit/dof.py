@@ -69,7 +69,8 @@ class DofFit(eqx.Module):
       picture where the parameter has one. It takes the residuals of 8 x 8 tiles of the image
       for independent of one another, and no others. A parameter that the pictures do not tell
       has a large one, or inf.
-    - `explained`: the share of the references' contrast, a ratio, that is explained.
+    - `explained`: the share of the references' contrast, a ratio, that is explained in the
+      pixels that have a say, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
       larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
     - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
@@ -246,22 +247,27 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     columns, rest, drawn, gain, offset = report(residual, end.unknowns)
     block, count = tiles(rest.shape[1:])
     block = jnp.tile(block, rest.shape[0])
-    spread = covariance(columns, rest.reshape(-1), block, count)
+    tree = ravel_pytree(end.unknowns)[1]
+    variances = tree(jnp.diagonal(covariance(columns, rest.reshape(-1), block, count)))
     if residual.is_robust:
+        # What a method gets wrong biases a lens, which is true or not; gamma, epsilon and
+        # threshold are what makes the method itself look most like the picture.
         alike = strata(model.circles(values), residual.scale, rest.shape[3])
-        spread = spread + covariance(columns, rest.reshape(-1), alike, 2 * BINS)
-    errors = ravel_pytree(end.unknowns)[1](jnp.sqrt(jnp.diagonal(spread)))
+        bias = tree(jnp.diagonal(covariance(columns, rest.reshape(-1), alike, 2 * BINS)))
+        for name in {*LENS, *DISPARITY}.intersection(variances):
+            variances[name] = variances[name] + bias[name]
     ones = jax.tree.map(jnp.ones_like, end.unknowns)
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
     one, is_plain = len(model.pictures.references) == 1, "footprint" not in model.names
     flat = eqx.tree_at(lambda r: r.model.corrects, residual, jnp.zeros(()))
     uncertainty = {}
     for name in (name for name in model.names if name != "footprint"):
-        error = jnp.abs(slopes[name].astype(float)) * errors[name]
+        error = jnp.abs(slopes[name].astype(float)) * jnp.sqrt(variances[name])
         uncertainty[name] = error[0] if one and name in LENS else error
     references = model.pictures.references
     middle = jnp.mean(references, axis=(1, 2), keepdims=True)
     contrast = jnp.mean(residual.weighted(references - middle) ** 2)
+    share = jnp.mean(jnp.isfinite(residual.scale).astype(contrast.dtype))
     names = ("gamma", "epsilon", "threshold", "scale", "shift", "footprint")
     return DofFit(
         lenses=tuple(model.lens(values, picture) for picture in range(len(references))),
@@ -271,7 +277,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
         losses=jnp.stack(end.losses),
         ends=ends,
         uncertainty=uncertainty,
-        explained=jnp.where(contrast > 0, 1 - jnp.mean(rest**2) / contrast, 1),
+        explained=jnp.where(contrast > 0, 1 - jnp.mean(rest**2) / contrast, 1) * share,
         clamped=jnp.mean(model.circles(values) > model.max_coc),
         result=end.result,
         **{name: values[name] for name in names},

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import itertools
 import re
 
 import jax.numpy as jnp
@@ -76,16 +77,8 @@ def quietly(reference, image, depth, values=TRUTH, max_coc=8, **kwargs):
     return fit.dof(reference, image, depth, max_coc=max_coc, progress=False, **arguments)
 
 
-@first(
-    ("sides", "dtype"),
-    [
-        ((0, 0, 0, 0), np.float32),
-        ((1, 1, 1, 1), np.float64),
-        ((0, 1, 1, 0), np.float64),
-        ((1, 0, 0, 1), np.float64),
-    ],
-    ids=str,
-)
+@first("dtype", [np.float32, np.float64])
+@first("sides", list(itertools.product((0, 1), repeat=4)), ids=str)
 def test_recovers_what_made_the_picture(sides, dtype):
     fitted = quietly(*picture(dtype), wrong(sides))
     assert fitted.success
@@ -94,22 +87,23 @@ def test_recovers_what_made_the_picture(sides, dtype):
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
     assert fitted.losses[-1] < 1e-3 * fitted.losses[0]
     # Seven searches, none of which goes on for long once it has arrived.
-    assert len(fitted.losses) < 120
+    assert len(fitted.losses) < 80
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("loss", ["robust", "squares"])
-def test_the_threshold_of_layered_scatter_is_found(loss):
-    image, depth = still_life(32)
-    lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 80.0)
-    draw = functools.partial(dof.layered, image, depth, max_coc=8.0)
-    given = draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)
-    options = {"method": "layered", "threshold": 2.0, "max_coc": 8.0, "loss": loss}
-    fitted = fit.dof(*given, **options)
-    values = fitted.lens.aperture, fitted.lens.focus_distance
-    np.testing.assert_allclose(values, (0.12, 3.0), rtol=1e-3)
-    # Robustly it is known to a few parts in ten: it makes a difference only beside edges.
-    assert fitted.threshold == pytest.approx(1.2, rel=1e-3 if loss == "squares" else 0.2)
+def test_the_threshold_of_layered_scatter_is_found():
+    image, depth = still_life(16)
+    lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 40.0)
+    draw = functools.partial(dof.layered, image, depth, max_coc=4.0)
+    fitted = fit.dof(
+        *(draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)),
+        method="layered",
+        threshold=2.0,
+        max_coc=4.0,
+        progress=False,
+    )
+    values = fitted.lens.aperture, fitted.lens.focus_distance, fitted.threshold
+    np.testing.assert_allclose(values, (0.12, 3.0, 1.2), rtol=0.01)
     assert set(fitted.uncertainty) == set(fit.LAYERED_PARAMETERS)
 
 
@@ -189,11 +183,10 @@ def test_any_solver_or_minimiser(solver):
 @pytest.mark.full
 def test_failure_is_said():
     start = wrong((0, 1, 0, 1))
-    options = {"max_steps": 1, "loss": "squares"}
     said = r"found no l\w+ in \d+ steps.*from [\de.-]+ to [\de.-]+"
     with pytest.raises(RuntimeError, match=said):
-        quietly(*picture(), start, **options)
-    fitted = quietly(*picture(), start, throw=False, **options)
+        quietly(*picture(), start, max_steps=3)
+    fitted = quietly(*picture(), start, max_steps=3, throw=False)
     assert not fitted.success
     assert "maximum number of steps" in str(fitted.result) and "maximum" in repr(fitted)
     assert fitted.result == optx.RESULTS.nonlinear_max_steps_reached
@@ -237,16 +230,15 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
     reference, image, depth = picture()
     rng = np.random.default_rng(2)
     misses = []
-    for _ in range(16):
+    for _ in range(24):
         fitted = quietly(reference + rng.normal(0, 0.01, reference.shape), image, depth)
         values = found(fitted)
         misses.append(
             [(values[name] - TRUTH[name]) / fitted.uncertainty[name] for name in TRUTH]
         )
     # By the median: one draw in eight makes epsilon's other minimum, at 1.4, the lower one.
-    # What is stated allows for a wrong model: it is larger than what noise alone makes.
     spread = np.median(np.abs(misses), axis=0) / 0.6745
-    assert ((spread > 0.25) & (spread < 1.5)).all(), spread
+    assert ((spread > 0.5) & (spread < 2)).all(), spread
 
 
 @pytest.mark.full
@@ -341,7 +333,7 @@ def test_wrong_pixels_do_not_decide():
     spoiled[np.random.default_rng(3).random(depth.shape) < 0.03] = 20.0
     fitted = quietly(spoiled, image, depth, wrong((0, 1, 1, 0)), throw=False)
     assert found(fitted) == pytest.approx(TRUTH, rel=0.02)
-    assert fitted.explained < 0.9
+    assert fitted.explained == pytest.approx(np.mean(spoiled < 20), abs=1e-3)
     # The searches are told, the best first, and none is better.
     ends = [float(end["aperture"][0]) for end in fitted.ends]
     assert ends[0] == pytest.approx(TRUTH["aperture"], rel=0.02) and len(ends) >= 3
