@@ -211,14 +211,12 @@ def fill(
 
     - `"rows"` takes the farther of the nearest known depths on either side in the row; in a
       row that knows nothing, in the column.
-    - `"guided"` takes the depth at the end of the cheapest path through the hole, from pixel to
-      pixel across their sides. A path costs its length and the edges of `image` that it
-      crosses, which are changes beyond those all about, so that a depth fills the surface that
-      the image shows. It also pays, as for an edge of a fifth of the image's range, where it
-      leaves the known pixels with a depth that is nearer, by a tenth, than what `"rows"` would
-      take there. The pixels that copy one depth hang together by their sides: none stands
-      alone. It knows nothing of slopes: a wide hole in a floor becomes flat steps. Paint on a
-      surface looks like an edge to it.
+    - `"guided"` takes the depth at the end of the cheapest path through the hole. A path costs
+      its length and, above all, the edges of `image` that it crosses, so that a depth fills
+      the surface that the image shows. It also pays where it leaves the known pixels with a
+      depth that is nearer than what `"rows"` would take there. At last the filled pixels take
+      the median of the 3 x 3 about them, twice, so that none stands alone. It knows nothing of
+      slopes: a wide hole in a floor becomes flat steps.
 
     **Arguments:**
 
