@@ -296,7 +296,7 @@ def record(name, row, device, cpu):
 
 
 def measured_value(row, device):
-    """What a row gives on another device, called once."""
+    """The result of one call of a row on another device."""
     out = jax.jit(row.function)(*jax.device_put(row.data, device))
     return [np.asarray(leaf) for leaf in jax.tree.leaves(out)]
 
@@ -362,7 +362,7 @@ def _native_walk(cupy, module, side):
 
 
 def beside_native(rows, side):
-    """What native CUDA takes, and our time over it; or a sentence that it is not there."""
+    """Milliseconds of native CUDA and the ratio of ours to them; or why there are none."""
     if (cupy := cuda.cupy()) is None:
         return "CuPy is not there: no native CUDA was measured."
     module, found = cupy.RawModule(code=cuda.SOURCE), []

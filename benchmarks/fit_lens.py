@@ -1,4 +1,4 @@
-"""What `fit.dof` finds of a lens, for `docs/fits.md`: how far off, what it states, seconds.
+"""Errors, stated errors and seconds of `fit.dof`, for `docs/fits.md`.
 
 `python -m benchmarks.fit_lens [MESH ...]` fits multi-pass pictures of 320 x 240 pixels of every
 scene, the still life if none is given, at three foci and two apertures, from starts that are

@@ -1,4 +1,4 @@
-"""What `fit.lights` finds, for `docs/fits.md`: truth, found, stated error, ratio, seconds.
+"""Truth, result, stated error, ratio and seconds of `fit.lights`, for `docs/fits.md`.
 
 `python -m benchmarks.fit_lights` prints it: the pictures of `tests/cases/lit.py`, a sun and a
 lamp in each, as they are and spoilt. Seconds are those of a second call, the median of five.

@@ -238,7 +238,7 @@ def _added_in_groups(image: Array, terms: list[Callable[[], Array]]) -> Array:
 
 
 def apart(image: Array, compute: Callable[[], Array]) -> Array:
-    """What `compute` returns, kept in memory: XLA moves nothing across it.
+    """The result of `compute`, kept in memory: XLA moves nothing across it.
 
     On a CPU it is a branch that is always taken, for which an accelerator's host would wait.
     """

@@ -42,6 +42,16 @@ __device__ float cover_of(float width, int column, float* slope) {
     float* line = shared + threadIdx.y * span * PLANES;                                  \
     __VA_ARGS__
 
+// The sources of a row: value, leak, and half-width, negative outside of the picture.
+#define LOAD_SOURCES(row)                                                                \
+    for (int k = threadIdx.x; k < span; k += WIDE) {                                     \
+        int sx = blockIdx.x * WIDE + k - reach, sy = y + row, s = sy * width + sx;       \
+        bool known = sx >= 0 && sx < width && sy >= 0 && sy < height;                    \
+        for (int c = 0; c < 4; ++c) line[c * span + k] = known ? value[c * size + s] : 0; \
+        line[4 * span + k] = known ? leak[s] : 0;                                        \
+        line[5 * span + k] = known ? half_width(radius[s], row, &slope) : -1;            \
+    }
+
 extern "C" __global__ void scatter(
     float* sums, const float* value, const float* radius, const float* leak, const float* coc,
     int height, int width, int reach
@@ -50,13 +60,7 @@ extern "C" __global__ void scatter(
     FOR_ROWS(float total[4] = {0, 0, 0, 0};)
     float own = is_here ? coc[here] : 0, sharp = 1 - clamp01(own - 1), slope;
     for (int row = -reach; row <= reach; ++row) {
-        for (int k = threadIdx.x; k < span; k += WIDE) {
-            int sx = blockIdx.x * WIDE + k - reach, sy = y + row, s = sy * width + sx;
-            bool known = sx >= 0 && sx < width && sy >= 0 && sy < height;
-            for (int c = 0; c < 4; ++c) line[c * span + k] = known ? value[c * size + s] : 0;
-            line[4 * span + k] = known ? leak[s] : 0;
-            line[5 * span + k] = known ? half_width(radius[s], row, &slope) : -1;
-        }
+        LOAD_SOURCES(row)
         __syncthreads();
         for (int column = -reach; column <= reach; ++column) {
             int k = threadIdx.x + reach + column;
@@ -121,13 +125,7 @@ extern "C" __global__ void adjoint_target(
     float sharp = 1 - clamp01(own - 1), blurring = inside01(own - 1);
     for (int c = 0; is_here && c < 4; ++c) mine[c] = bar[c * size + here];
     for (int row = -reach; row <= reach; ++row) {
-        for (int k = threadIdx.x; k < span; k += WIDE) {
-            int sx = blockIdx.x * WIDE + k - reach, sy = y + row, s = sy * width + sx;
-            bool known = sx >= 0 && sx < width && sy >= 0 && sy < height;
-            for (int c = 0; c < 4; ++c) line[c * span + k] = known ? value[c * size + s] : 0;
-            line[4 * span + k] = known ? leak[s] : 0;
-            line[5 * span + k] = known ? half_width(radius[s], row, &slope) : -1;
-        }
+        LOAD_SOURCES(row)
         __syncthreads();
         for (int column = -reach; column <= reach; ++column) {
             int k = threadIdx.x + reach + column;

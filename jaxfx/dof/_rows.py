@@ -38,7 +38,7 @@ def _sums(
     by_source: bool,
     slopes: bool,
 ) -> list[Array]:
-    """What a `Sweep` of `_taps` gives."""
+    """`Sweep.sums` of `_taps`, by rows of offsets."""
     height, width = radius.shape
     own, other = _listed(own), _listed(other)
     covers = [radius] * (2 if slopes else 1)

@@ -1,4 +1,4 @@
-"""What a tap of scatter adds, forward and back, whatever program sweeps over the taps."""
+"""The term of one tap in the sums of scatter, and its derivatives, for any sweep over taps."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -48,6 +48,7 @@ def to_planes(sprites: Sprites) -> Planes:
 
 
 def stacked(value: Float[Array, "height width value"]) -> Float[Array, "value height width"]:
+    """The channels as planes."""
     return jnp.moveaxis(value, -1, 0)
 
 

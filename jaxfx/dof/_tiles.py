@@ -75,7 +75,7 @@ def _sweep(
     by_source: bool,
     slopes: bool,
 ) -> list[Array]:
-    """What a `Sweep` of `_taps` gives."""
+    """`Sweep.sums` of `_taps`, tile by tile."""
     height, width = radius.shape
     tall, wide = min(TILE[0], -(-height // 8) * 8), min(TILE[1], -(-width // 8) * 8)
     rows, columns = -(-height // tall), -(-width // wide)

@@ -244,8 +244,8 @@ def _cyclic_reduction(
     """Elimination of all unknowns at once, also without a difference (Hockney 1965).
 
     A row is `(excess + left + right) x[i] - left x[i - reach] - right x[i + reach] = heat[i]`.
-    The rows at `i - reach` and `i + reach`, so many times that their unknowns drop out, are
-    added to it: then it reaches twice as far, and after log2(size) turns beyond both ends.
+    Multiples of the rows at `i - reach` and `i + reach` that eliminate their unknowns are added
+    to it: then it reaches twice as far, and after log2(size) turns beyond both ends.
     """
     left = jnp.pad(conductance, ((1, 0), (0, 0), (0, 0)))
     right = jnp.pad(conductance, ((0, 1), (0, 0), (0, 0)))

@@ -1,4 +1,4 @@
-"""What a picture tells of its lights: standard errors, and what can't be told apart."""
+"""Standard errors of lights, and which lights and parameters a picture does not determine."""
 
 from typing import Any, NamedTuple
 
@@ -42,7 +42,7 @@ Groups = tuple[tuple[int, ...], ...]
 
 
 class Evidence(NamedTuple):
-    """What a picture tells of its lights: of `LightsFit`, the fields that say so."""
+    """The fields of `LightsFit` on how well a picture determines its lights."""
 
     errors: Errors
     groups: Groups
@@ -223,7 +223,7 @@ def _apart(one: Any, other: Any, name: str, error: Any, other_error: Any) -> flo
 
 
 def _groups(pairs: list[tuple[int, int]]) -> Groups:
-    """What is joined by pairs."""
+    """The connected components of a graph whose edges are the pairs."""
     groups: list[set[int]] = []
     for pair in pairs:
         touched = [group for group in groups if group & {*pair}]

@@ -30,8 +30,9 @@ DISPARITY = ("scale", "shift")
 # Start values of zero have no logarithm.
 _SMALLEST = 1e-6
 
-# An edge in depth is where the defocus bends by so many pixels from one pixel to the next: a
-# strip of half that width is hidden from the middle of the lens and seen from its rim.
+# Second difference of the defocus between neighbouring pixels, in pixels, at an edge in depth.
+# It is 0 on a plane. With a larger one edges between near-by surfaces are missed, with a
+# smaller one curved surfaces are taken for edges.
 _STEP = 0.25
 
 # Of the noise: the share of differences below one standard deviation, and the least deviation,
@@ -54,7 +55,7 @@ _SMALL_COC = 8.0
 
 
 class Pictures(NamedTuple):
-    """What is compared: all of one size, in one type.
+    """The images of a fit, all of one size and type.
 
     - `references`: one for each lens.
     - `image`, `depth`, `behind`: as in the method.
@@ -156,7 +157,7 @@ class Model(eqx.Module):
         return jnp.where(depth > 0, circles, 0)
 
     def __call__(self, values: Values) -> Float[Array, "picture height width channel"]:
-        """What the method draws."""
+        """The images of the method, with the footprint's correction where it is free."""
         depth, behind = self.depths(values)
 
         def draw(aperture, focus, focal):
@@ -182,7 +183,7 @@ class Model(eqx.Module):
 def _missing_blur(
     drawn: Float[Array, "height width channel"], coc: Float[Array, "height width"]
 ) -> Float[Array, "height width channel"]:
-    """What small circles would add, had their sprites the second moments of their discs.
+    """The correction of an image for the second moments of small sprites.
 
     A sprite covers whole pixels: up to a circle of a pixel it blurs nothing, a little above it
     blurs too much. Half the second derivative, times the moment that lacks, makes up for it.

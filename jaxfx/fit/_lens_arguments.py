@@ -125,6 +125,7 @@ def check_moves(
 
 
 def names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]:
+    """The names of the parameters to fit, in the order of `PARAMETERS` and `DISPARITY`."""
     usual = PARAMETERS[method]
     known = usual + DISPARITY
     names = tuple(n for n in known if n in (usual if parameters is None else parameters))
@@ -136,6 +137,7 @@ def names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]
 
 
 def ratios(ratios: Any) -> tuple[str, ...]:
+    """The parameters of the lenses whose ratios are known, in the order of `LENS`."""
     names = tuple(name for name in LENS if name in ratios)
     if len(names) != len(tuple(ratios)):
         raise ValueError(f"`dof(ratios=...)` must name some of {LENS}, got {tuple(ratios)}.")

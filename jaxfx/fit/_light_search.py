@@ -1,4 +1,4 @@
-"""The search of `fit.lights`: least squares with weights of pixels that are made anew."""
+"""The search of `fit.lights`: iteratively reweighted least squares."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -19,12 +19,11 @@ from jaxfx.light import Light
 
 _logger = logging.getLogger("jaxfx")
 
-# How often the weights of pixels are made anew, by how much the noise may seem to fall each
-# time, and the largest change of a weight that ends it.
+# The most reweightings of a search; the factor by which the estimated noise may fall in each;
+# and the largest change of a weight at which they end.
 _REWEIGHTINGS, _EASE, _SETTLED = 32, 2.0, 1e-2
 
-# A search between two sets of weights has converged when so many steps gain less than this
-# share.
+# When a search between two reweightings has converged: see `descend`.
 _LOOSE = {"patience": 2, "gain": 1e-2}
 
 

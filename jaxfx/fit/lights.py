@@ -50,7 +50,7 @@ class LightsFit(eqx.Module):
     - `image`: height width 3, the picture under them.
     - `losses`: the mean squared residual, as weighted at the time, at the start of each search
       and after every step, in squared units of radiance, always with the best colours where
-      colours are fitted. It jumps where the weights of pixels are made anew.
+      colours are fitted. It jumps where the pixels are reweighted.
     - `uncertainty`: for each light a standard error of every parameter that was fitted, in its
       own unit: 3 for the colour and the position, an angle in radians for the direction, 2
       (inner, outer) for the angles. It takes the residuals of 8 x 8 tiles of the image for
@@ -128,7 +128,7 @@ def lights(
 
     Weighted least squares. The picture is linear in the colours: for given positions,
     directions and angles the best ones are solved for, and only the rest is searched (variable
-    projection). Then pixels are weighed anew by what they differ, and so on: shadows that the
+    projection). Then pixels are reweighted by their residuals, and so on: shadows that the
     model lacks, highlights that are clipped and unknown materials come to have no say. A weight
     is Tukey's biweight of a pixel's difference and that of the sum over 5 x 5 about it, each by
     its noise, which medians tell, and which is eased down, by halves, from what is far off at
