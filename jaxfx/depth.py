@@ -36,6 +36,8 @@ def clean(
 ) -> Float[Array, "height width"]:
     """Depth in scene units with the holes of this module, from numbers as a file stores them.
 
+    >>> import numpy as np
+    >>> from jaxfx import depth
     >>> depth.clean(np.array([[0, 1500]], np.uint16), scale=1 / 1000)  # millimetres to metres
     Array([[nan, 1.5]], dtype=float32)
 
