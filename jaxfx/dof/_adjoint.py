@@ -15,22 +15,23 @@ Planes = TypeVar("Planes", bound=Any)
 
 
 class Program(NamedTuple):
-    """One way to compute a kernel, of the number of pixels that sprites reach and of planes."""
+    """A program for a kernel: functions of the static reach of sprites and of planes."""
 
-    forward: Callable[[int, Any], Array]
-    tangent: Callable[[int, Any, Any], Array]
-    adjoint: Callable[[int, Any, Array], Any]
+    forward: Callable[[Any, Any], Array]
+    tangent: Callable[[Any, Any, Any], Array]
+    adjoint: Callable[[Any, Any, Array], Any]
 
 
 def with_adjoint(
-    forward: Callable[[int, Planes], Array],
-    tangent: Callable[[int, Planes, Planes], Array],
-    adjoint: Callable[[int, Planes, Array], Planes],
-    plain: Callable[[int, Planes], Array],
+    forward: Callable[[Any, Planes], Array],
+    tangent: Callable[[Any, Planes, Planes], Array],
+    adjoint: Callable[[Any, Planes, Array], Planes],
+    plain: Callable[[Any, Planes], Array],
     accelerator: Program | None = None,
-) -> Callable[[int, Planes], Array]:
+) -> Callable[[Any, Planes], Array]:
     """`forward(reach, planes)`, to be mapped and differentiated, in both modes and again.
 
+    - `reach`: static; how far sprites reach, in pixels or as the kernel states it.
     - `planes`: sprites as a named tuple of arrays, in which `value` has the result's shape.
     - `tangent(reach, planes, dot)`: its derivative along `dot`.
     - `adjoint(reach, planes, bar)`: the transpose of that.
@@ -55,11 +56,11 @@ def with_adjoint(
     forward, tangent, adjoint = map(mapped, cpu, accelerator or cpu)
 
     @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
-    def kernel(reach: int, planes: Planes) -> Array:
+    def kernel(reach: Any, planes: Planes) -> Array:
         return forward(reach, planes)
 
     @kernel.defjvp
-    def _(reach: int, primals: Any, tangents: Any) -> tuple[Array, Array]:
+    def _(reach: Any, primals: Any, tangents: Any) -> tuple[Array, Array]:
         (planes,), (dot,) = primals, tangents
         push = ft.partial(tangent, reach, planes)
         pull = ft.partial(adjoint, reach, planes)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof._paint import _add, _read
 from jaxfx.dof._spans import _too_bright
-from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
+from jaxfx.dof._sprites import POINT_RADIUS, reach, segment_integral
 from jaxfx.dof._tiles import inside
 
 
@@ -37,6 +37,27 @@ CHUNK, BRIGHT_CHUNK = 1024, 16
 SLICES = 128
 # At most so many slices later are those of the next sheet.
 APART = 2 * SLICES + 2
+
+
+class Extent(NamedTuple):
+    """How far sprites reach and slices go, as far as it is known when a program is compiled.
+
+    - `max_coc`: the largest circle of confusion, pixels.
+    - `slices`: to either side of the focus, `max_coc` over the threshold, rounded up. None if
+      the threshold is traced.
+    """
+
+    max_coc: float
+    slices: int | None
+
+    @property
+    def reach(self) -> int:
+        """How many pixels away, along an axis, any sprite covers anything."""
+        return reach(self.max_coc)
+
+    def reach_of(self, radius: float) -> int:
+        """The same of sprites of at most this radius."""
+        return reach(min(2 * radius, self.max_coc))
 
 
 class Sheets(NamedTuple):

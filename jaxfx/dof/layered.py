@@ -1,6 +1,7 @@
 """Depth of field by scatter that knows what hides what, from one layer of depth or two."""
 
 import functools as ft
+import math
 from typing import Any
 
 import jax
@@ -8,13 +9,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
-from jaxfx._checks import Number, check, check_depth, check_image, items, parameter
+from jaxfx._checks import Number, check, check_depth, check_image, is_concrete, items, parameter
 from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof._inputs import check_arguments, compiled, defocused, with_own
 from jaxfx.dof._sheets import composited
-from jaxfx.dof._slices import SLICES, Sheets
+from jaxfx.dof._slices import SLICES, Extent, Sheets
 from jaxfx.dof._spoiled import spoiled
-from jaxfx.dof._sprites import POINT_RADIUS, reach
+from jaxfx.dof._sprites import POINT_RADIUS
 from jaxfx.lens import Lens
 
 
@@ -96,7 +97,11 @@ def layered(
     threshold = parameter("layered(threshold=...)", threshold)
     check("layered(threshold=...)", threshold, lambda v: v >= 0, "0 or positive")
     second = None if behind is None else _second_layer(image, depth, own, behind)
-    return _layered(image, depth, lens, max_coc, second, threshold)
+    slices = None
+    if is_concrete(threshold):
+        slices = math.ceil(max_coc / max(float(threshold), max_coc / SLICES))
+    extent = Extent(max_coc, slices)
+    return _layered(image, depth, lens, extent, second, threshold)
 
 
 def _second_layer(
@@ -116,8 +121,9 @@ def _second_layer(
     return second.astype(image.dtype), farther, compiled("layered", lens, farther)
 
 
-@ft.partial(jax.jit, static_argnames=("max_coc",))
-def _layered(image, depth, lens, max_coc, behind, threshold):
+@ft.partial(jax.jit, static_argnames=("extent",))
+def _layered(image, depth, lens, extent, behind, threshold):
+    max_coc = extent.max_coc
     view = defocused(image, depth, lens, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
     through = jnp.where(view.missing, 0, jnp.ones_like(view.defocus))
@@ -135,11 +141,11 @@ def _layered(image, depth, lens, max_coc, behind, threshold):
         through = jnp.where(there, clip01(seen / _SEEN) * apart, 0)
         layers.append(_sheet(second.image, farther, through, view.missing, threshold))
         spoils |= spoiled(second.bad, jnp.abs(second.defocus), max_coc)
-    far = reach(max_coc)
+    far = extent.reach
     # Beyond the frame all goes on as it ends there.
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
     sheets = jax.tree.map(lambda *x: jnp.stack([pad(each) for each in x]), *layers)
-    light, late = jnp.split(jnp.moveaxis(composited(far, sheets), 0, -1), 2, axis=-1)
+    light, late = jnp.split(jnp.moveaxis(composited(extent, sheets), 0, -1), 2, axis=-1)
     late = with_own(late, view.image, view.missing)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
     return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)

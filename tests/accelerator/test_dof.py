@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfx import ThinLens, dof
-from jaxfx.dof import diffusion
+from jaxfx.dof import _sheets, diffusion
 from jaxfx.dof.separable import _along_rows
 from tests.dof.test_diffusion import (  # noqa: F401
     test_a_point_of_light_has_the_variance_of_its_disc,
@@ -15,10 +15,25 @@ from tests.dof.test_diffusion import (  # noqa: F401
     test_implicit_keeps_its_digits_at_any_radius,
     test_nothing_flows_into_focus_or_past_a_bad_pixel,
 )
+from tests.dof.test_layered import (  # noqa: F401
+    test_a_blurred_edge_before_a_plane_in_focus_shows_it_sharp,
+    test_a_constant_image_is_kept,
+    test_a_pixel_that_is_not_a_number_stays_local,
+    test_a_second_layer_that_is_nowhere_is_none,
+    test_a_sharp_edge_before_a_blurred_plane_stays_sharp,
+    test_a_slanted_floor_lets_nothing_through,
+)
 from tests.dof.test_separable import (  # noqa: F401
     test_a_bad_pixel_spoils_its_square,
     test_a_point_of_light_has_the_variance_of_its_disc as test_a_point_keeps_its_variance,
     test_equals_the_loop,
+)
+from tests.dof.test_sheets import (
+    EXTENT,
+    assert_close,
+    check_derivatives,
+    in_plain_numpy,
+    random_sheets,
 )
 from tests.helpers.quick import check_slopes
 
@@ -63,3 +78,17 @@ def test_any_number_of_taps_together_gives_the_same_pass(together):
         planes, epsilon, 5, together
     )
     np.testing.assert_allclose(pass_of(together), pass_of(1), rtol=1e-13)
+
+
+# With the number of slices known when the program is compiled, and not known.
+@pytest.mark.parametrize("slices", [3, None])
+def test_slices_are_composited_as_the_equations_have_it(slices):
+    extent = EXTENT._replace(slices=slices)
+    sheets = random_sheets(2)
+    composited = jax.jit(_sheets.composited, static_argnums=0)(extent, sheets)
+    assert_close(composited, in_plain_numpy(3, sheets))
+
+
+@pytest.mark.parametrize("slices", [3, None])
+def test_the_derivatives_of_slices_are_those_of_dense_sums(slices):
+    check_derivatives(EXTENT._replace(slices=slices))

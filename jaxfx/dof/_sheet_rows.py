@@ -1,0 +1,260 @@
+"""The sums of `layered` by rows of offsets, several slices at a time, over the whole image.
+
+For devices on which a launch costs more than what it computes. A group of slices is summed in
+one sweep over the offsets that its sprites reach, then composited slice by slice in one kernel.
+The adjoint sweeps over the same offsets and is owned by the sources: no scatter is left. If the
+threshold is concrete, the number of slices is known when the program is compiled; else the host
+looks at the data.
+
+What it does not do well: every tap of a group's largest sprite is computed at every pixel for
+every slice of the group, whatever the image holds.
+"""
+
+import functools as ft
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfx._numerics import clip01, sum_planes
+from jaxfx.dof._adjoint import Program
+from jaxfx.dof._filling import Filling, begin_reading, fill, nothing_filled, read_slice
+from jaxfx.dof._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
+from jaxfx.dof._sprites import segment_integral
+
+
+# Slices per group: 24 planes of sums, of RGB. With 8, XLA keeps the shares of every tap in
+# memory (three times the time at a radius of 32); with fewer, more groups compute coverages.
+GROUP = 6
+
+
+@ft.partial(jax.custom_jvp)
+def _half_width(radius: Float[Array, "*size"], row: Int[Array, ""]) -> Float[Array, "*size"]:
+    """Mean half-width of each disc in a row of pixels, `row` rows from its centre."""
+    return _half_width_and_slope(radius, row, slope=False)[0]
+
+
+def _half_width_and_slope(radius, row, *, slope):
+    distance = jnp.abs(row).astype(radius.dtype)
+    upper = segment_integral(radius, distance + 0.5, slope)
+    lower = segment_integral(radius, jnp.abs(distance - 0.5), slope)
+    sign = jnp.sign(distance - 0.5)  # half of the middle row lies below its middle
+    return [x - sign * y for x, y in zip(upper, lower, strict=True)]
+
+
+@_half_width.defjvp
+def _(primals, tangents):
+    width, slope = _half_width_and_slope(*primals, slope=True)
+    return width, slope * tangents[0]
+
+
+def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
+    """Runs of like groups from the front: first slice, groups, slices per group, and reach.
+
+    Slices near the focus reach less far. A reach is the largest, or a half, a quarter of it and
+    so on: each other one would be a program of its own to compile.
+    """
+    total = 2 * slices + 1
+    count = -(-total // GROUP)
+    bounds = [round(k * total / count) - slices for k in range(count + 1)]
+    # A slice is at most so many pixels of radius thick.
+    thick = extent.max_coc / 2 / max(slices - 1, 1)
+    runs = []
+    for low, high in itertools.pairwise(bounds):
+        needed, reach = extent.reach_of(thick * (max(-low, high - 1) + 1)), extent.reach
+        while needed <= reach // 2:
+            reach = reach // 2
+        if runs and runs[-1][2:] == (high - low, reach):
+            first, groups, *alike = runs.pop()
+            runs.append((first, groups + 1, *alike))
+        else:
+            runs.append((low, 1, high - low, reach))
+    return runs
+
+
+def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state: Any) -> Any:
+    """Fold `visit(sheet, number, first, count, reach, state)` over groups, from the front."""
+    for number in range(len(sheets.radius)):
+        sheet = jax.tree.map(lambda x, n=number: x[n], sheets)
+        if extent.slices is None:
+            first = jnp.floor(sheet.place.min()).astype(int)
+            slices = jnp.ceil(sheet.place.max()).astype(int) - first + 1
+            runs = [(first, -(-slices // GROUP), GROUP, extent.reach)]
+        else:
+            runs = _groups(extent, extent.slices)
+        for first, groups, size, reach in runs:
+            # One run after the other, or all of them would take memory at once.
+            sheet, state = jax.lax.optimization_barrier((sheet, state))
+            visit_run = ft.partial(visit, sheet, number, count=size, reach=reach)
+
+            def turn(k, state, visit_run=visit_run, first=first, size=size):
+                return visit_run(first=first + k * size, state=state)
+
+            state = jax.lax.fori_loop(0, groups, turn, state)
+    return state
+
+
+def _arriving(
+    extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
+) -> list[Float[Array, "value height width"]]:
+    """What the sprites of each slice of a group sum to at each pixel of the frame."""
+    far, across = extent.reach, across_of(reach)
+    height, width = (n - 2 * far for n in sheet.radius.shape)
+    wider = max(0, across - far)
+    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(wider, wider)])
+    value = pad(jnp.where(sheet.value[-1:] > 0, sheet.value, 0))
+    radius, tilt_x, tilt_y, place = (pad(x) for x in (sheet.radius, *sheet.tilt, sheet.place))
+    slices = (first + jnp.arange(count)).astype(place.dtype)[:, None, None]
+
+    def turn(index, sums):
+        row = index - reach
+        at_row = ft.partial(
+            jax.lax.dynamic_slice_in_dim,
+            start_index=far - row,
+            slice_size=height,
+            axis=-2,
+            allow_negative_indices=False,
+        )
+        own, slant, turned, places, light = map(at_row, (radius, tilt_x, tilt_y, place, value))
+        span = _half_width(jnp.where(own > 0, own, 1), row)
+        moved = slant * span * span / 3
+        start, end, facing = moved - span, moved + span, 1 + turned * row.astype(own.dtype)
+        start, end, facing = jax.lax.optimization_barrier((start, end, facing))
+        for column in range(-across, across + 1):
+            low = far + wider - column
+            there = lambda x, low=low: jax.lax.slice_in_dim(x, low, low + width, axis=-1)
+            edge = 0.5 - column
+            cover = (clip01(there(end) + edge) - clip01(there(start) + edge)) * there(facing)
+            shares = cover[None] * share_of(there(places)[None] - slices)
+            sums = sums + shares[:, None] * there(light)[None]
+        return sums
+
+    # Made here, or those of all groups would be made at once.
+    value, zero = jax.lax.optimization_barrier((value, jnp.zeros((), value.dtype)))
+    nothing = jnp.broadcast_to(zero, (count, len(value), height, width))
+    return [*jax.lax.fori_loop(0, 2 * reach + 1, turn, nothing)]
+
+
+def _away(
+    sheet: Sheets, first: Int[Array, ""], count: int
+) -> Float[Array, "slice rows columns"]:
+    """How many slices each sprite lies behind each slice of a group."""
+    slices = first + jnp.arange(count)
+    return sheet.place[None] - slices.astype(sheet.place.dtype)[:, None, None]
+
+
+def _filled(extent: Extent, sheets: Sheets) -> Filling:
+    def add(sheet, number, first, count, reach, state):
+        for k, arriving in enumerate(_arriving(extent, sheet, first, count, reach)):
+            state = fill(number * APART + first + k, arriving, state)
+        return state
+
+    return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
+
+
+def forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
+    """Light and, last, how much of the lens it fills; then the same weighted."""
+    filling = _filled(extent, sheets)
+    return jnp.concatenate([filling.light, filling.late])
+
+
+def tangent(
+    extent: Extent, sheets: Sheets, dot: Sheets
+) -> Float[Array, "twice_value height width"]:
+    """The derivative of `forward` along `dot`: its loops are short enough for JAX's own."""
+    return jax.jvp(ft.partial(forward, extent), (sheets,), (dot,))[1]
+
+
+def adjoint(
+    extent: Extent, sheets: Sheets, bar: Float[Array, "twice_value height width"]
+) -> Sheets:
+    """The transpose of `tangent`."""
+    reading = begin_reading(_filled(extent, sheets), bar)
+
+    def read(sheet, number, first, count, reach, state):
+        bars, carry = state
+        bar = []
+        for k, arriving in enumerate(_arriving(extent, sheet, first, count, reach)):
+            seen, carry = read_slice(
+                reading, number * APART + first + k, arriving, tuple(carry)
+            )
+            bar.append(seen)
+        found = _read_back(extent, sheet, first, reach, bar)
+        bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
+        return bars, carry
+
+    state = jax.tree.map(jnp.zeros_like, sheets), reading.start
+    return _each_group(extent, sheets, read, state)[0]
+
+
+def _read_back(
+    extent: Extent,
+    sheet: Sheets,
+    first: Int[Array, ""],
+    reach: int,
+    bar: list[Float[Array, "value height width"]],
+) -> Sheets:
+    """The adjoint of `_arriving` at `bar`, one stack for each slice of the group."""
+    far, across = extent.reach, across_of(reach)
+    rows, columns = sheet.radius.shape
+    away = _away(sheet, first, len(bar))
+    value, (tilt_x, tilt_y) = sheet.value, sheet.tilt
+    shares, slopes = share_of(away), share_slope_of(away)
+    pad = [(0, 0), (0, 0), (far + reach, far + reach), (far + across, far + across)]
+    seen = jnp.pad(jnp.stack(bar), pad)
+    column_of = jnp.arange(columns)[None] + across
+
+    def turn(index, sums):
+        row = index - reach
+        planes = jax.lax.dynamic_slice_in_dim(
+            seen, index, rows, axis=-2, allow_negative_indices=False
+        )
+        distance = row.astype(value.dtype)
+        span, slope = _half_width_and_slope(sheet.radius, row, slope=True)
+        by_tilt = span * span / 3
+        start, end = tilt_x * by_tilt - span, tilt_x * by_tilt + span
+        start, end = jax.lax.optimization_barrier((start, end))
+        read = jnp.zeros((len(bar), *value.shape), value.dtype)
+        for column in range(-across, across + 1):
+            low, edge = across + column, 0.5 - column
+            cover = clip01(end + edge) - clip01(start + edge)
+            read = read + cover * jax.lax.slice_in_dim(planes, low, low + columns, axis=-1)
+        read = jax.lax.optimization_barrier(read)
+
+        def over_slices(weights, read):
+            return jnp.sum(weights[:, None] * read, axis=0)
+
+        def at(edge):
+            """The cotangent of the coverage where an end lies: no other one changes with it."""
+            here = column_of + jnp.floor(edge + 0.5).astype(int)
+            # Out of reach are only sprites that have no share in the group.
+            found = jnp.take_along_axis(planes, here[None, None], axis=-1, mode="clip")
+            return sum_planes(value * over_slices(shares, found))
+
+        of_value, of_tilt_x, of_radius, of_tilt_y, of_place = sums
+        facing = 1 + tilt_y * distance
+        at_end, at_start = at(end), at(start)
+        moved, grown = facing * (at_end - at_start), facing * (at_end + at_start)
+        arriving = over_slices(shares, read)
+        return (
+            of_value + facing * arriving,
+            of_tilt_x + moved * by_tilt,
+            of_radius + slope * (grown + moved * tilt_x * span * (2 / 3)),
+            of_tilt_y + distance * sum_planes(value * arriving),
+            of_place + facing * sum_planes(value * over_slices(slopes, read)),
+        )
+
+    zero = jnp.zeros_like(sheet.radius)
+    sums = jnp.zeros_like(value), zero, zero, zero, zero
+    of_value, of_tilt_x, of_radius, of_tilt_y, of_place = jax.lax.fori_loop(
+        0, 2 * reach + 1, turn, sums
+    )
+    found = Sheets(of_value, of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)
+    # As forward has it: what is not let through passes no derivative.
+    return jax.tree.map(lambda x: jnp.where(value[-1] > 0, x, 0), found)
+
+
+SHEET_ROWS = Program(forward, tangent, adjoint)
