@@ -75,6 +75,10 @@ def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
     return runs
 
 
+def _add_group(visit, first, size, reach, k, state):
+    return visit(first + k * size, size, reach, state)
+
+
 def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state: Any) -> Any:
     """Fold `visit(sheet, number, first, count, reach, state)` over groups, from the front."""
     for number in range(len(sheets.radius)):
@@ -88,12 +92,8 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
         for first, groups, size, reach in runs:
             # One run after the other, or all of them would take memory at once.
             sheet, state = jax.lax.optimization_barrier((sheet, state))
-            visit_run = ft.partial(visit, sheet, number, count=size, reach=reach)
-
-            def turn(k, state, visit_run=visit_run, first=first, size=size):
-                return visit_run(first=first + k * size, state=state)
-
-            state = jax.lax.fori_loop(0, groups, turn, state)
+            add = ft.partial(_add_group, ft.partial(visit, sheet, number), first, size, reach)
+            state = jax.lax.fori_loop(0, groups, add, state)
     return state
 
 
@@ -178,9 +178,7 @@ def adjoint(
         bars, carry = state
         bar = []
         for k, arriving in enumerate(_arriving(extent, sheet, first, count, reach)):
-            seen, carry = read_slice(
-                reading, number * APART + first + k, arriving, tuple(carry)
-            )
+            seen, carry = read_slice(reading, number * APART + first + k, arriving, carry)
             bar.append(seen)
         found = _read_back(extent, sheet, first, reach, bar)
         bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
@@ -221,7 +219,9 @@ def _read_back(
         for column in range(-across, across + 1):
             low, edge = across + column, 0.5 - column
             cover = clip01(end + edge) - clip01(start + edge)
-            read = read + cover * jax.lax.slice_in_dim(planes, low, low + columns, axis=-1)
+            read = read + cover[None, None] * jax.lax.slice_in_dim(
+                planes, low, low + columns, axis=-1
+            )
         read = jax.lax.optimization_barrier(read)
 
         def over_slices(weights, read):
@@ -240,7 +240,7 @@ def _read_back(
         moved, grown = facing * (at_end - at_start), facing * (at_end + at_start)
         arriving = over_slices(shares, read)
         return (
-            of_value + facing * arriving,
+            of_value + facing[None] * arriving,
             of_tilt_x + moved * by_tilt,
             of_radius + slope * (grown + moved * tilt_x * span * (2 / 3)),
             of_tilt_y + distance * sum_planes(value * arriving),
