@@ -144,7 +144,7 @@ PROCESS_WIDE = re.compile(
 )
 # How PyOpenGL is told which library to load, before it is imported; and matplotlib, which no
 # two threads may use at once, which fonts to put into a file. Neither takes an argument.
-MAY_CHANGE_PROCESS = {"scene/_opengl.py": {"os.environ"}, "tradeoff.py": {"matplotlib.rc"}}
+MAY_CHANGE_PROCESS = {"scene/opengl.py": {"os.environ"}, "tradeoff.py": {"matplotlib.rc"}}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

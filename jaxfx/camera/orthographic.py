@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
 from jaxfx._numerics import normalize, working_dtype
 from jaxfx._sampling import pixel_centers
+from jaxfx.camera._records import Projection, Rays
 from jaxfx.camera._rigid import (
     DepthMap,
     Depths,
@@ -32,7 +33,7 @@ class OrthographicCamera(eqx.Module):
     **Arguments:**
 
     - `pixels_per_unit`: scale, in pixels per scene unit.
-    - `centre`: 2, the pixel (x, y) of the optical axis.
+    - `center`: 2, the pixel (x, y) of the optical axis.
     - `world_from_camera`: 4x4 rigid pose.
 
     **Raises:** `ValueError` for a wrong shape, a number that is not finite, a scale that is not
@@ -41,31 +42,29 @@ class OrthographicCamera(eqx.Module):
     **Gradient:** exact with respect to every field.
     """
 
-    SHAPES: ClassVar = {"pixels_per_unit": (), "centre": (2,), "world_from_camera": (4, 4)}
+    SHAPES: ClassVar = {"pixels_per_unit": (), "center": (2,), "world_from_camera": (4, 4)}
 
     pixels_per_unit: Float[Array, ""]
-    centre: Float[Array, "2"]
+    center: Float[Array, "2"]
     world_from_camera: Float[Array, "4 4"]
 
-    def __init__(self, pixels_per_unit: Any, centre: Any, world_from_camera: Any):
+    def __init__(self, pixels_per_unit: Any, center: Any, world_from_camera: Any):
         name = "OrthographicCamera(pixels_per_unit)"
         self.pixels_per_unit = parameter(name, pixels_per_unit)
         check(name, self.pixels_per_unit, lambda v: (v > 0) & (v < np.inf), "positive")
-        self.centre = parameter("OrthographicCamera(centre)", centre, (2,))
-        check("OrthographicCamera(centre)", self.centre, np.isfinite, "finite")
+        self.center = parameter("OrthographicCamera(center)", center, (2,))
+        check("OrthographicCamera(center)", self.center, np.isfinite, "finite")
         self.world_from_camera = rigid_pose(
             "OrthographicCamera(world_from_camera)", world_from_camera
         )
 
-    def rays(
-        self, *, height: WholeNumber, width: WholeNumber
-    ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+    def rays(self, *, height: WholeNumber, width: WholeNumber) -> Rays:
         """The ray through each pixel's centre.
 
         **Arguments:** `height`, `width`: static; the picture's size in pixels.
 
         **Returns:** origins at depth 0, in scene units, and unit directions, all the optical
-        axis; height width 3 each, in the world's axes, in the type of `centre`.
+        axis; height width 3 each, in the world's axes, in the type of `center`.
 
         **Raises:** `ValueError` for a size that is no positive integer, or a batch of cameras.
 
@@ -76,11 +75,12 @@ class OrthographicCamera(eqx.Module):
             whole_number("rays(height=...)", height),
             whole_number("rays(width=...)", width),
         )
-        dtype = self.centre.dtype
+        dtype = self.center.dtype
         pixels = pixel_centers(*size, working_dtype(dtype))
         origins = self.unproject(pixels, jnp.zeros_like(pixels[..., 0]))
         axis = normalize(self.world_from_camera[:3, 2].astype(origins.dtype))
-        return origins.astype(dtype), jnp.broadcast_to(axis, origins.shape).astype(dtype)
+        directions = jnp.broadcast_to(axis, origins.shape)
+        return Rays(origins.astype(dtype), directions.astype(dtype))
 
     def points(self, depth: DepthMap) -> Float[Array, "height width 3"]:
         """What every pixel of a depth image shows: the world point at its centre.
@@ -97,7 +97,7 @@ class OrthographicCamera(eqx.Module):
         pixels, depth, dtype = read_map(depth)
         return self.unproject(pixels, depth).astype(dtype)
 
-    def project(self, points: Points) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
+    def project(self, points: Points) -> Projection:
         """Pixels and depth of world points.
 
         **Arguments:** `points`: world positions, `... 3`, in scene units, floats or integers.
@@ -114,8 +114,8 @@ class OrthographicCamera(eqx.Module):
         dtype = points.dtype
         local = to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         pixels = local[..., :2] * self.pixels_per_unit.astype(local.dtype)
-        pixels = pixels + each(self.centre, pixels)
-        return pixels.astype(dtype), local[..., 2].astype(dtype)
+        pixels = pixels + each(self.center, pixels)
+        return Projection(pixels.astype(dtype), local[..., 2].astype(dtype))
 
     def unproject(self, pixels: Pixels, depth: Depths) -> Float[Array, "... 3"]:
         """World points of pixels at a depth: the inverse of `project`.
@@ -131,7 +131,7 @@ class OrthographicCamera(eqx.Module):
         **Gradient:** exact.
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
-        plane = pixels - each(self.centre, pixels)
+        plane = pixels - each(self.center, pixels)
         plane = plane / self.pixels_per_unit.astype(pixels.dtype)
         local = jnp.concatenate([plane, depth[..., None]], axis=-1)
         return to_world(self.world_from_camera, local).astype(dtype)

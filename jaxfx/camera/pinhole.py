@@ -11,6 +11,7 @@ from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_num
 from jaxfx._numerics import inverse, normalize, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import _conventions
+from jaxfx.camera._records import Projection, Rays
 from jaxfx.camera._rigid import (
     DepthMap,
     Depths,
@@ -111,28 +112,28 @@ class PinholeCamera(eqx.Module):
     def look_at(
         cls,
         eye: Any,
-        target: Any,
+        at: Any,
         *,
         up: Any,
         fov_y: Any,
         height: WholeNumber,
         width: WholeNumber,
     ) -> "PinholeCamera":
-        """The camera at `eye` that has `target` at the middle of its picture.
+        """The camera at `eye` that has `at` in the middle of its picture.
 
         **Arguments:**
 
-        - `eye`, `target`: world positions, 3.
+        - `eye`, `at`: world positions, 3.
         - `up`: a world direction, 3, that points to the top of the picture.
         - `fov_y`, `height`, `width`: as in `from_fov`.
 
         **Returns:** the camera.
 
-        **Raises:** `ValueError` where `eye` is `target` or `up` lies along the view.
+        **Raises:** `ValueError` where `eye` is `at` or `up` lies along the view.
 
         **Gradient:** exact; zero where the pose is degenerate.
         """
-        pose = look_at_pose(eye, target, up)
+        pose = look_at_pose(eye, at, up)
         height, width = _size("look_at", height, width)
         return cls.from_fov(fov_y, height=height, width=width, world_from_camera=pose)
 
@@ -272,9 +273,7 @@ class PinholeCamera(eqx.Module):
         """
         return cls(*_conventions.opengl(view, projection, _size("from_opengl", height, width)))
 
-    def rays(
-        self, *, height: WholeNumber, width: WholeNumber
-    ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+    def rays(self, *, height: WholeNumber, width: WholeNumber) -> Rays:
         """The ray through each pixel's centre.
 
         **Arguments:** `height`, `width`: static; the picture's size in pixels.
@@ -292,7 +291,7 @@ class PinholeCamera(eqx.Module):
         local = transformed(inverse(self.intrinsics), homogeneous(pixels))
         directions = normalize(transformed(self.world_from_camera[:3, :3], local)).astype(dtype)
         eye = self.world_from_camera[:3, 3].astype(dtype)
-        return jnp.broadcast_to(eye, directions.shape), directions
+        return Rays(jnp.broadcast_to(eye, directions.shape), directions)
 
     def points(self, depth: DepthMap) -> Float[Array, "height width 3"]:
         """What every pixel of a depth image shows: the world point at its centre.
@@ -309,7 +308,7 @@ class PinholeCamera(eqx.Module):
         pixels, depth, dtype = read_map(depth)
         return self.unproject(pixels, depth).astype(dtype)
 
-    def project(self, points: Points) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
+    def project(self, points: Points) -> Projection:
         """Pixels and depth of world points.
 
         **Arguments:** `points`: world positions, `... 3`, in scene units, floats or integers.
@@ -329,7 +328,8 @@ class PinholeCamera(eqx.Module):
         local = to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         depth = local[..., 2]
         scaled = transformed(self.intrinsics, local)
-        return (scaled[..., :2] / depth[..., None]).astype(dtype), depth.astype(dtype)
+        pixels = scaled[..., :2] / depth[..., None]
+        return Projection(pixels.astype(dtype), depth.astype(dtype))
 
     def unproject(self, pixels: Pixels, depth: Depths) -> Float[Array, "... 3"]:
         """World points of pixels at a depth: the inverse of `project`.

@@ -27,29 +27,17 @@ any case and after any dot: `left.Normal`.
 | signed integers         | FLOAT, exact or refused: EXR has none; they come back float32 |
 """
 
-from typing import Any
-
-from jaxfx.exr.frame import read_gbuffer, write_gbuffer
+from jaxfx.exr.frame import Cache, read_gbuffer, write_gbuffer
 from jaxfx.exr.layers import read, write
-from jaxfx.exr.rgbd import read_rgbd
+from jaxfx.exr.rgbd import RGBD, read_rgbd
 
 
 __all__ = [
+    "RGBD",
+    "Cache",
     "read",
     "read_gbuffer",
     "read_rgbd",
     "write",
     "write_gbuffer",
 ]
-
-# Functions of `jaxfx.io` that stood here first, and are still found under these names.
-_MOVED = frozenset({"linear_from_srgb", "read_png", "srgb_from_linear", "write_png"})
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MOVED:
-        # Loaded when it is asked for: `jaxfx.io` reads EXR files by this package.
-        from jaxfx import io
-
-        return getattr(io, name)
-    raise AttributeError(f"module `jaxfx.exr` has no attribute {name!r}")

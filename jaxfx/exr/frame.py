@@ -1,7 +1,7 @@
 """Deep frame buffers and their cameras in EXR files."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,17 @@ from jaxfx.gbuffer import GBuffer
 Camera = PinholeCamera | OrthographicCamera
 
 _PASSES = ("color", "shader", "ambient", "diffuse", "specular", "normal", "depth", "roughness")
+
+
+class Cache(NamedTuple):
+    """A deep frame buffer and its camera, as `read_gbuffer` finds them in a file.
+
+    - `gbuffer`: the `GBuffer`.
+    - `camera`: the `PinholeCamera` or `OrthographicCamera`, or None where the file has none.
+    """
+
+    gbuffer: GBuffer
+    camera: Camera | None
 
 
 def write_gbuffer(path: StrPath, gbuffer: GBuffer, *, camera: Camera | None = None) -> None:
@@ -43,14 +54,12 @@ def write_gbuffer(path: StrPath, gbuffer: GBuffer, *, camera: Camera | None = No
     write_planes(path, {name: getattr(gbuffer, name) for name in _PASSES}, attributes)
 
 
-def read_gbuffer(
-    path: StrPath, *, max_pixels: int = MAX_PIXELS, verify: bool = True
-) -> tuple[GBuffer, Camera | None]:
+def read_gbuffer(path: StrPath, *, max_pixels: int = MAX_PIXELS, verify: bool = True) -> Cache:
     """Read what `write_gbuffer` wrote; other layers in the file are let be.
 
     **Arguments:** `path`, `max_pixels`, `verify`: as for `read`.
 
-    **Returns:** the deep frame buffer; and the camera, or None where the file has none.
+    **Returns:** a `Cache`: `gbuffer`, and `camera`, which is None where the file has none.
 
     **Raises:** `ValueError` and `OSError`, as `read`; a pass that is missing is named.
 
@@ -67,7 +76,7 @@ def read_gbuffer(
     if not np.array_equal(shader, passes["shader"]):
         raise ValueError(f"`{path}` must have whole numbers in the pass `shader`.")
     try:
-        return GBuffer(**passes | {"shader": shader}), _camera(header)
+        return Cache(GBuffer(**passes | {"shader": shader}), _camera(header))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"`{path}` must hold a deep frame buffer: {error}") from error
 
@@ -81,7 +90,7 @@ def _matrix(values: np.ndarray) -> np.ndarray:
 def _intrinsics(camera: Camera) -> np.ndarray:
     if isinstance(camera, PinholeCamera):
         return np.asarray(camera.intrinsics)
-    scale, centre = np.asarray(camera.pixels_per_unit), np.asarray(camera.centre)
+    scale, centre = np.asarray(camera.pixels_per_unit), np.asarray(camera.center)
     matrix = np.eye(3, dtype=np.result_type(scale, centre))
     matrix[0, 0] = matrix[1, 1] = scale
     matrix[:2, 2] = centre

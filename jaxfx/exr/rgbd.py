@@ -1,6 +1,7 @@
 """An image and its depth from one EXR file, as renderers name them."""
 
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,13 +17,25 @@ _IMAGE = ("combined", "rgba", "rgb", "color", "beauty")
 _DEPTH = ("depth", "z", "zdepth")
 
 
+class RGBD(NamedTuple):
+    """An image and its depth, of the same pixels, as `read_rgbd` finds them in a file.
+
+    - `image`: height width channel, linear, float32.
+    - `depth`: height width, in the file's units, along the axis; NaN where it is missing, inf
+      for background.
+    """
+
+    image: Float[np.ndarray, "height width channel"]
+    depth: Float[np.ndarray, "height width"]
+
+
 def read_rgbd(
     path: StrPath,
     *,
     layer: str | None = None,
     max_pixels: int = MAX_PIXELS,
     verify: bool = True,
-) -> tuple[Float[np.ndarray, "height width channel"], Float[np.ndarray, "height width"]]:
+) -> RGBD:
     """Read an image and its depth from one file: Blender's multilayer EXR, say.
 
     The image is the pass `Combined` of a layer (or `rgba`, `rgb`, `color`, `beauty`, or what
@@ -79,7 +92,7 @@ def read_rgbd(
             f"windows {sorted(windows[0] | windows[1])}."
         )
     image, depth = layers[keys[0]], flat(layers[keys[1]])
-    return image.astype(np.float32), np.asarray(depths.clean(depth.astype(np.float32)))
+    return RGBD(image.astype(np.float32), np.asarray(depths.clean(depth.astype(np.float32))))
 
 
 def _windows(channels: Mapping[str, tuple], key: str) -> set[tuple]:

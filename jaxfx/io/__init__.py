@@ -6,7 +6,8 @@ OpenEXR files are `jaxfx.exr`'s.
 
 from jaxfx.io.color import read_color
 from jaxfx.io.depth import read_depth
-from jaxfx.io.png import linear_from_srgb, read_png, srgb_from_linear, write_png
+from jaxfx.io.png import read_png, write_png
+from jaxfx.io.srgb import linear_from_srgb, srgb_from_linear
 
 
 __all__ = [

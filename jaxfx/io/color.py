@@ -10,8 +10,8 @@ from jaxfx import exr
 from jaxfx._extras import needs
 from jaxfx._files import StrPath
 from jaxfx.exr.rgbd import choose_image, images_of
-from jaxfx.io._pixels import jpeg_values, log_profile
-from jaxfx.io.png import decode_png, linear_from_srgb
+from jaxfx.io.png import decode_png
+from jaxfx.io.srgb import linear_from_srgb, log_profile
 
 
 PNG, JPEG, EXR = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"v/1\x01"
@@ -80,3 +80,18 @@ def _decode_jpeg(path: StrPath, data: bytes) -> np.ndarray:
     is_turned, down, right = _UPRIGHT.get(turn, (False, 1, 1))
     upright = (values.swapaxes(0, 1) if is_turned else values)[::down, ::right]
     return linear_from_srgb(upright).astype(np.float32)
+
+
+def jpeg_values(data: bytes) -> np.ndarray:
+    """The numbers of a JPEG file, height width channel (1 or 3), over their largest.
+
+    As stored: where the file says how to turn it upright, that is left to the caller.
+    """
+    with needs("io"):
+        from PIL import Image
+
+    picture = Image.open(BytesIO(data), formats=("JPEG",))
+    if picture.mode not in ("L", "RGB"):
+        raise ValueError(f"`mode` must be grey or RGB, got {picture.mode}.")
+    array = np.asarray(picture, np.float64)
+    return array.reshape(*array.shape[:2], -1) / 255

@@ -1,6 +1,8 @@
-"""PNG files, and the sRGB curve that screens want."""
+"""PNG files: the numbers that they store, and images in linear light.
 
-from collections.abc import Callable
+`jaxfx.scene` reads textures by `png_values`.
+"""
+
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -9,63 +11,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfx._checks import as_numpy
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
-from jaxfx.io._pixels import log_profile, png_values
+from jaxfx.io.srgb import linear_from_srgb, log_profile, recolor, srgb_from_linear
 
 
 # The gamma that files give to say sRGB.
 _SRGB_GAMMA = 1 / 2.2
-
-
-def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The sRGB curve: from linear light to what a screen is sent.
-
-    **Arguments:** `linear`: any shape; 0 is black, 1 the screen's white.
-
-    **Returns:** the same type and shape, not clipped: outside [0, 1] the curve goes on.
-
-    **Raises:** `ValueError` for integers.
-
-    **Gradient:** none; the host side.
-
-    Source: IEC 61966-2-1, the piecewise curve.
-    """
-    values, dtype = _floats("srgb_from_linear(linear)", linear)
-    power = np.maximum(values, 0.0031308) ** (1 / 2.4)
-    curve = np.where(values <= 0.0031308, 12.92 * values, 1.055 * power - 0.055)
-    return curve.astype(dtype)
-
-
-def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The inverse of `srgb_from_linear`.
-
-    **Arguments:** `srgb`: any shape, 0 to 1.
-
-    **Returns:** linear light, the same type and shape, not clipped.
-
-    **Raises:** `ValueError` for integers: 8-bit numbers are to be divided by 255 first.
-
-    **Gradient:** none; the host side.
-
-    Source: IEC 61966-2-1, the piecewise curve.
-    """
-    values, dtype = _floats("linear_from_srgb(srgb)", srgb)
-    power = ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4
-    curve = np.where(values <= 0.04045, values / 12.92, power)
-    return curve.astype(dtype)
-
-
-def _floats(name: str, values: Any) -> tuple[np.ndarray, np.dtype]:
-    """Numbers to compute a curve of, in float32 at least, and their own type."""
-    array = as_numpy(name, values)
-    if array.dtype.kind in "biu":
-        raise ValueError(
-            f"`{name}` must hold floats, 1 for the largest, got {array.dtype}. Divide 8-bit "
-            "numbers by 255 and 16-bit ones by 65535."
-        )
-    return array.astype(np.result_type(array.dtype, np.float32)), array.dtype
 
 
 def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) -> None:
@@ -141,7 +93,37 @@ def decode_png(path: StrPath, data: bytes) -> np.ndarray:
     return recolor(lambda codes: codes ** (1 / gamma), values).astype(np.float32)
 
 
-def recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
-    """`curve` on the colours of an image, not on its alpha."""
-    colors = 3 if values.shape[2] > 2 else 1
-    return np.concatenate([curve(values[:, :, :colors]), values[:, :, colors:]], axis=2)
+def png_values(data: bytes) -> np.ndarray:
+    """The numbers of a PNG file, height width channel, over their largest."""
+    with needs("io"):
+        from PIL import Image
+
+    def pixels(layout: str = "") -> np.ndarray:
+        picture: Any = Image.open(BytesIO(data), formats=("PNG",))
+        if layout:
+            picture.tile = [(*picture.tile[0][:3], layout)]
+        palette = "RGBA" if "transparency" in picture.info else "RGB"
+        mode = {"1": "L", "P": palette}.get(picture.mode, picture.mode)
+        array = np.asarray(picture.convert(mode) if mode != picture.mode else picture)
+        return array.reshape(*array.shape[:2], -1).astype(np.float64)
+
+    # Of 16-bit colours Pillow keeps the high bytes. It gives the low ones when asked for the
+    # other byte order, and both of grey and alpha as the four channels of RGBA.
+    header = Image.open(BytesIO(data), formats=("PNG",))
+    layout = str(header.tile[0][3])
+    largest = 65535 if "16" in layout else 255
+    if layout == "LA;16B":
+        high_low = pixels("RGBA")
+        codes = 256 * high_low[:, :, ::2] + high_low[:, :, 1::2]
+    elif layout in ("RGB;16B", "RGBA;16B"):
+        codes = 256 * pixels() + pixels(layout[:-1] + "L")
+    else:
+        codes = pixels()
+    # One colour of a file without alpha may be transparent. Greys of 2 and 4 bits are spread
+    # over 8, and the colour is not.
+    key = header.info.get("transparency")
+    if key is not None and header.mode != "P":
+        key = np.atleast_1d(key) * {"L;2": 85, "L;4": 17}.get(layout, 1)
+        is_opaque = np.any(codes != key, axis=2, keepdims=True)
+        codes = np.concatenate([codes, largest * is_opaque], axis=2)
+    return codes / largest

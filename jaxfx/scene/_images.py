@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from jaxfx._extras import MissingExtraError, needs
-from jaxfx.io._pixels import jpeg_values, png_values
+from jaxfx.io.color import jpeg_values
+from jaxfx.io.png import png_values
 from jaxfx.scene._part import UnreadableError
 
 

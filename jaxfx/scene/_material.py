@@ -23,7 +23,7 @@ class Sampler:
       which goes on with the texel at the edge.
     - `nearest`: whether the nearest texel is taken. Else the read is bilinear.
     - `transform`: 2x3, from (u, v, 1) of the scene to the coordinates that are read.
-    - `second_uv`: whether (u, v) comes from the scene's `second_uv`. Else it is `uv`.
+    - `use_second_uv`: whether (u, v) comes from the scene's `second_uv`. Else it is `uv`.
 
     **Raises:** `ValueError` for another name of a wrap, or another transform.
 
@@ -35,7 +35,7 @@ class Sampler:
     wrap: tuple[str, str] = ("repeat", "repeat")
     nearest: bool = False
     transform: Sequence[Sequence[float | int]] = ((1, 0, 0), (0, 1, 0))
-    second_uv: bool = False
+    use_second_uv: bool = False
 
     def __post_init__(self):
         if len(self.wrap) != 2 or not set(self.wrap) <= set(WRAPS):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxfx._checks import whole_number
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.scene import _embree, _opengl
+from jaxfx.scene import embree, opengl
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._surface import Hits, depth_image, intersect, to_gbuffer
 from jaxfx.scene._view import View, check_size
@@ -21,9 +21,9 @@ from jaxfx.scene._view import View, check_size
 _logger = logging.getLogger("jaxfx.scene")
 _Camera = PinholeCamera | OrthographicCamera
 _FirstFaces = Callable[[Scene, View, np.ndarray], np.ndarray]
-_BACKENDS = {"opengl": _opengl, "embree": _embree}
-_COARSE = 1e-3  # of the scene's scale: a rounding of the camera's place to speak of
-_GAP = 1e-5  # between layers, of their depth and of the scene's scale
+_BACKENDS = {"opengl": opengl, "embree": embree}
+_COARSE = 1e-3  # of the scene's radius: a rounding of the camera's place to speak of
+_GAP = 1e-5  # between layers, of their depth and of the scene's radius
 
 
 def gbuffer(
@@ -33,7 +33,7 @@ def gbuffer(
     height: int,
     width: int,
     backend: str = "auto",
-    layer: int = 0,
+    layer_index: int = 0,
 ) -> GBuffer:
     """The deep frame buffer of a scene: what each pixel's centre shows, not antialiased.
 
@@ -49,9 +49,9 @@ def gbuffer(
     - `height`, `width`: image size in pixels.
     - `backend`: "opengl" rasterises; "embree" casts rays; "auto" takes OpenGL where it works
       and else Embree, and tells the logger `jaxfx.scene` which.
-    - `layer`: 0 is what the camera sees; 1 the next surface behind it that shows its front
-      (its corners counter-clockwise), and so on. Surfaces closer together than some 1e-5 of
-      their depth and of the scene's size may count as one.
+    - `layer_index`: 0 is what the camera sees; 1 the next surface behind it that shows its
+      front (its corners counter-clockwise), and so on. Surfaces closer together than some
+      1e-5 of their depth and of the scene's size may count as one.
 
     **Returns:** a `GBuffer` of float32. Pixels that show nothing have depth inf, shader -1 and
     zeros.
@@ -62,11 +62,11 @@ def gbuffer(
     **Gradient:** none, with respect to the camera or anything else: this runs on the host,
     outside every transform.
     """
-    view, hits, size = _visible("gbuffer", scene, camera, height, width, backend, layer)
-    if layer == 0 and len(hits.pixel) == 0:
+    view, hits, size = _visible("gbuffer", scene, camera, height, width, backend, layer_index)
+    if layer_index == 0 and len(hits.pixel) == 0:
         raise ValueError(
             "`scene.gbuffer(camera)` must see the scene, got nothing in view: the scene lies "
-            f"about {np.round(scene.centre, 3).tolist()}, "
+            f"about {np.round(scene.center, 3).tolist()}, "
             f"{np.round(scene.extent, 3).tolist()} in size."
         )
     return to_gbuffer(scene, view, hits, *size)
@@ -79,7 +79,7 @@ def depth(
     height: int,
     width: int,
     backend: str = "auto",
-    layer: int = 0,
+    layer_index: int = 0,
 ) -> Float[Array, "height width"]:
     """The depth along the optical axis of what each pixel's centre shows: a shadow map, say.
 
@@ -91,7 +91,7 @@ def depth(
 
     **Gradient:** none: this runs on the host, outside every transform.
     """
-    _, hits, size = _visible("depth", scene, camera, height, width, backend, layer)
+    _, hits, size = _visible("depth", scene, camera, height, width, backend, layer_index)
     return jnp.asarray(depth_image(hits, *size))
 
 
@@ -102,7 +102,7 @@ def object_ids(
     height: int,
     width: int,
     backend: str = "auto",
-    layer: int = 0,
+    layer_index: int = 0,
 ) -> Int[Array, "height width"]:
     """Which object each pixel's centre shows, as an index into `scene.names`.
 
@@ -114,7 +114,7 @@ def object_ids(
 
     **Gradient:** none: these are integers.
     """
-    _, hits, size = _visible("object_ids", scene, camera, height, width, backend, layer)
+    _, hits, size = _visible("object_ids", scene, camera, height, width, backend, layer_index)
     return _ids(hits, scene.face_objects, size)
 
 
@@ -125,7 +125,7 @@ def material_ids(
     height: int,
     width: int,
     backend: str = "auto",
-    layer: int = 0,
+    layer_index: int = 0,
 ) -> Int[Array, "height width"]:
     """Which material each pixel's centre shows, as an index into `scene.materials`.
 
@@ -137,7 +137,7 @@ def material_ids(
 
     **Gradient:** none: these are integers.
     """
-    _, hits, size = _visible("material_ids", scene, camera, height, width, backend, layer)
+    _, hits, size = _visible("material_ids", scene, camera, height, width, backend, layer_index)
     return _ids(hits, scene.face_materials, size)
 
 
@@ -150,21 +150,27 @@ def _ids(
 
 
 def _visible(
-    caller: str, scene: Any, camera: Any, height: Any, width: Any, backend: Any, layer: Any
+    caller: str,
+    scene: Any,
+    camera: Any,
+    height: Any,
+    width: Any,
+    backend: Any,
+    layer_index: Any,
 ) -> tuple[View, Hits, tuple[int, int]]:
-    """The camera, what it sees of layer `layer`, and the picture's size."""
+    """The camera, what it sees of layer `layer_index`, and the picture's size."""
     height, width = check_size(caller, height, width)
     view = View.of(camera, f"scene.{caller}")
     if not isinstance(scene, Scene):
         raise ValueError(
             f"`scene.{caller}(scene)` must be a Scene, got {type(scene).__name__}."
         )
-    name, expected = f"scene.{caller}(layer=...)", "an integer from 0"
-    layer = whole_number(name, layer, lambda n: n >= 0, expected)
+    name, expected = f"scene.{caller}(layer_index=...)", "an integer from 0"
+    layer_index = whole_number(name, layer_index, lambda n: n >= 0, expected)
     _warn_of_rounding(scene, camera, caller)
     first_faces = _backend(caller, backend)
     hits = intersect(scene, view, first_faces(scene, view, np.zeros((height, width))))
-    for _ in range(layer):
+    for _ in range(layer_index):
         faces = _next_faces(first_faces, scene, view, hits, (height, width))
         hits = intersect(scene, view, faces)
     return view, hits, (height, width)
@@ -174,14 +180,14 @@ def _warn_of_rounding(scene: Scene, camera: _Camera, caller: str) -> None:
     """Say where a camera's numbers have not kept its place to a thousandth of the scene."""
     pose = np.asarray(camera.world_from_camera)
     rounding = float(np.spacing(np.abs(pose[:3, 3]).max())) / 2
-    if rounding > _COARSE * scene.scale:
+    if rounding > _COARSE * scene.radius:
         _logger.warning(
             "scene.%s(camera): the camera's place is rounded to %.2g in %s, where the scene is "
             "%.2g in size: move both to the origin, or set jax_enable_x64",
             caller,
             rounding,
             pose.dtype,
-            2 * scene.scale,
+            2 * scene.radius,
         )
 
 
@@ -198,7 +204,7 @@ def _next_faces(
     behind = np.full(shape, np.inf)
     behind.flat[hits.pixel] = hits.depth
     while np.isfinite(behind).any():
-        start = behind + gap * (behind + scene.scale)
+        start = behind + gap * (behind + scene.radius)
         met = intersect(scene, view, first_faces(scene, view, start))
         passed = met.depth > start.flat[met.pixel]
         done = passed & met.front

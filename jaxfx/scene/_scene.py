@@ -15,14 +15,14 @@ class Viewpoint(NamedTuple):
 
     **Arguments:**
 
-    - `eye`, `target`: world positions, 3.
+    - `eye`, `at`: world positions, 3: where the camera stands, and what is in the middle.
     - `fov`: the field of view of the picture's shorter side, in radians.
 
     **Gradient:** none.
     """
 
     eye: tuple[float, float, float]
-    target: tuple[float, float, float]
+    at: tuple[float, float, float]
     fov: float
 
 
@@ -95,7 +95,9 @@ class Scene:
         self._require_index("faces", len(self.vertices))
         self._require_index("face_materials", len(self.materials))
         self._require_index("face_objects", len(self.names))
-        asked = [s for each in self.materials for s in each.samplers.values() if s.second_uv]
+        asked = [
+            s for each in self.materials for s in each.samplers.values() if s.use_second_uv
+        ]
         if asked and self.second_uv is None:
             raise ValueError(
                 "`Scene(second_uv=...)` must be given for a `Sampler` that reads it, got None."
@@ -134,7 +136,7 @@ class Scene:
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property
-    def centre(self) -> Float[np.ndarray, "3"]:
+    def center(self) -> Float[np.ndarray, "3"]:
         """The middle of the bounding box: 3, a world position."""
         return self.bounds.mean(axis=0)
 
@@ -144,7 +146,7 @@ class Scene:
         return self.bounds[1] - self.bounds[0]
 
     @property
-    def scale(self) -> float:
+    def radius(self) -> float:
         """Half the bounding box's diagonal, in scene units; 1 for a box of a single point."""
         return float(np.linalg.norm(self.extent)) / 2 or 1.0
 
@@ -155,5 +157,5 @@ class Scene:
         Visibility is decided on these, so that float32 is as good for a scene far from the
         origin or very small as for any other.
         """
-        unit = (self.vertices - self.centre) / self.scale
+        unit = (self.vertices - self.center) / self.radius
         return np.ascontiguousarray(unit.astype(np.float32)[self.faces])

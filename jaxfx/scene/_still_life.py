@@ -38,7 +38,7 @@ def still_life() -> Scene:
     _foreground(parts, creation)
     _middle(parts, creation)
     _background(parts, creation)
-    return parts.scene(Viewpoint(eye=(0.0, 1.25, 0.0), target=(0.0, 0.72, -3.0), fov=0.8))
+    return parts.scene(Viewpoint(eye=(0.0, 1.25, 0.0), at=(0.0, 0.72, -3.0), fov=0.8))
 
 
 def _room(parts: "_Parts", creation: Any) -> None:

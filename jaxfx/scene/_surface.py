@@ -221,7 +221,7 @@ def _sampler(material: Material, name: str) -> Sampler:
 
 
 def _uv(scene: Scene, sampler: Sampler) -> Float[np.ndarray, "face 3 2"]:
-    if sampler.second_uv and scene.second_uv is not None:
+    if sampler.use_second_uv and scene.second_uv is not None:
         return scene.second_uv
     return scene.uv
 

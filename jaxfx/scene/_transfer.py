@@ -19,7 +19,7 @@ from jaxfx._checks import as_numpy, whole_number
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer, Transfer
-from jaxfx.scene import _embree
+from jaxfx.scene import embree
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._surface import Hits, at_hits
 
@@ -39,16 +39,16 @@ class _Points(NamedTuple):
 
 
 def visible(
-    scene: Scene, start: Float[ArrayLike, "*place 3"], end: Float[ArrayLike, "*places 3"]
+    scene: Scene, origin: Float[ArrayLike, "*place 3"], end: Float[ArrayLike, "*places 3"]
 ) -> Bool[Array, "..."]:
     """Whether nothing of the scene stands between two points, by a ray of Embree's.
 
-    Both may lie on surfaces: the last 1e-4 of the scene's scale on either side does not count.
+    Both may lie on surfaces: the last 1e-4 of the scene's radius on either side does not count.
 
     **Arguments:**
 
     - `scene`: from `load`, `from_trimesh` or `still_life`.
-    - `start`, `end`: world positions; ... 3 each, of shapes that broadcast.
+    - `origin`, `end`: world positions; ... 3 each, of shapes that broadcast.
 
     **Returns:** a bool for each pair.
 
@@ -58,7 +58,7 @@ def visible(
     """
     _require_embree("visible")
     ends = []
-    for name, value in (("start", start), ("end", end)):
+    for name, value in (("origin", origin), ("end", end)):
         points = as_numpy(f"scene.visible({name})", value)
         if points.shape[-1:] != (3,):
             raise ValueError(
@@ -66,7 +66,7 @@ def visible(
             )
         ends.append(points.astype(np.float64))
     one, other = np.broadcast_arrays(*ends)
-    seen = _embree.unobstructed(scene, one.reshape(-1, 3), other.reshape(-1, 3))
+    seen = embree.unobstructed(scene, one.reshape(-1, 3), other.reshape(-1, 3))
     return jnp.asarray(seen.reshape(one.shape[:-1]))
 
 
@@ -75,7 +75,7 @@ def transfer(
     gbuffer: GBuffer,
     camera: PinholeCamera | OrthographicCamera,
     *,
-    points: int = 1024,
+    point_count: int = 1024,
     rank: int = 64,
     seed: int = 0,
 ) -> Transfer:
@@ -84,15 +84,15 @@ def transfer(
     A point of normal M and area A, r away along w, sends a pixel of normal N the share
     `max(N.w, 0) * max(-M.w, 0) * A / (pi * r**2 + A)` of what it sends back, if they see each
     other. The matrix of these is kept as its first `rank` singular vectors. It takes up to
-    height * width * `points` rays, some 2 million a second; lights come later.
+    height * width * `point_count` rays, some 2 million a second; lights come later.
 
     **Arguments:**
 
     - `scene`: what the cache was made from.
     - `gbuffer`, `camera`: the cache, height width, and its camera.
-    - `points`: how many stand for the surfaces; they send light from their faces' fronts
+    - `point_count`: how many stand for the surfaces; they send light from their faces' fronts
       (corners counter-clockwise). The error falls as one over the square root of it.
-    - `rank`: singular vectors; at most `points`.
+    - `rank`: singular vectors; at most `point_count`.
     - `seed`: of the points' places.
 
     **Returns:** the `Transfer`, in float32, for `relight.indirect`.
@@ -108,8 +108,8 @@ def transfer(
     _require_embree("transfer")
     check_camera("scene.transfer(camera)", camera)
     gbuffer = check_gbuffer("scene.transfer(gbuffer)", gbuffer)
-    points = _count("points", points, None)
-    rank = _count("rank", rank, points)
+    point_count = _count("point_count", point_count, None)
+    rank = _count("rank", rank, point_count)
     shown = np.isfinite(gbuffer.depth) & (gbuffer.depth > 0) & (gbuffer.shader >= 0)
     shown = np.asarray(shown)
     if not shown.any():
@@ -124,8 +124,8 @@ def transfer(
         chosen = rng.choice(len(place), min(count, len(place)), replace=False)
         return place[chosen], normal[chosen]
 
-    senders = _choose(scene, points, some(_JUDGES), rng)
-    gram = sum(rows.T @ rows for rows in _blocks(scene, *some(_ROWS * points), senders))
+    senders = _choose(scene, point_count, some(_JUDGES), rng)
+    gram = sum(rows.T @ rows for rows in _blocks(scene, *some(_ROWS * point_count), senders))
     send = np.linalg.eigh(gram)[1][:, ::-1][:, :rank].T
     receive = np.zeros((height, width, rank), np.float32)
     blocks = _blocks(scene, place, normal, senders)
@@ -194,7 +194,7 @@ def _blocks(
         area, squared = points.area[point], squared[point, pixel]
         share = cosines[point, pixel] / squared * area / (np.pi * squared + area)
         rows = np.zeros((len(here), len(points.area)))
-        seen = _embree.unobstructed(scene, points.position[point], here[pixel])
+        seen = embree.unobstructed(scene, points.position[point], here[pixel])
         rows[pixel, point] = share * seen
         yield rows
 
@@ -208,5 +208,5 @@ def _count(name: str, value: Any, most: int | None) -> int:
 
 
 def _require_embree(caller: str) -> None:
-    if problem := _embree.problem():
+    if problem := embree.problem():
         raise RuntimeError(f"`scene.{caller}` needs Embree: {problem}")

@@ -50,7 +50,7 @@ class View(NamedTuple):
         else:
             intrinsics = np.eye(3)
             intrinsics[[0, 1], [0, 1]] = float(camera.pixels_per_unit)
-            intrinsics[:2, 2] = np.asarray(camera.centre)
+            intrinsics[:2, 2] = np.asarray(camera.center)
         view = cls(intrinsics, np.asarray(camera.world_from_camera, np.float64), perspective)
         if not (
             np.isfinite(view.intrinsics).all() and np.isfinite(view.world_from_camera).all()
@@ -117,22 +117,20 @@ def default_camera(scene: Scene, *, height: int, width: int) -> PinholeCamera:
     height, width = check_size("default_camera", height, width)
     tangents = np.array([width, height]) / min(height, width)
     if scene.viewpoint is not None:
-        eye, target, fov = scene.viewpoint
+        eye, at, fov = scene.viewpoint
     else:
-        target, fov = scene.centre, np.radians(35)
+        at, fov = scene.center, np.radians(35)
         backward = np.array([0.55, 0.4, 1.0]) / np.linalg.norm([0.55, 0.4, 1.0])
         right = np.cross([0, 1, 0], backward)
         right /= np.linalg.norm(right)
-        points = (scene.points - target).T
+        points = (scene.points - at).T
         across = np.abs(np.stack([right, np.cross(backward, right)]) @ points)
         reach = 0.9 * np.tan(fov / 2) * tangents[:, None]
-        eye = target + backward * np.max(
-            np.maximum(across / reach, scene.scale / 2) + backward @ points
+        eye = at + backward * np.max(
+            np.maximum(across / reach, scene.radius / 2) + backward @ points
         )
     fov_y = 2 * np.arctan(np.tan(fov / 2) * tangents[1])
-    return PinholeCamera.look_at(
-        eye, target, up=[0, 1, 0], fov_y=fov_y, height=height, width=width
-    )
+    return PinholeCamera.look_at(eye, at, up=[0, 1, 0], fov_y=fov_y, height=height, width=width)
 
 
 def default_lights(

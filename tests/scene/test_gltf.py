@@ -240,7 +240,7 @@ def test_each_texture_has_its_own_coordinates(gltf, uv, texels, codes):
     camera = scene.default_camera(loaded, height=8, width=8)
     assert np.isfinite(scene.gbuffer(loaded, camera, height=8, width=8).roughness).all()
     sampler = loaded.materials[0].samplers["metallic_roughness"]
-    assert sampler.second_uv
+    assert sampler.use_second_uv
     np.testing.assert_allclose(loaded.second_uv[0], (mirrored * [1, -1] + [0, 1])[[0, 1, 2]])
 
 

@@ -82,7 +82,7 @@ def _faces_of_tile(
     clip, depth, farthest = _transforms(scene, view, height, width)
     if farthest <= 0:
         return np.full((height, width), -1, np.int32)
-    unit_start = np.ascontiguousarray(start / scene.scale, np.float32)
+    unit_start = np.ascontiguousarray(start / scene.radius, np.float32)
     draw = lambda: _rasterizer().draw(scene, clip, depth, farthest, unit_start)
     return _thread.submit(draw).result()
 
@@ -90,24 +90,24 @@ def _faces_of_tile(
 def _transforms(
     scene: Scene, view: View, height: int, width: int
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4"], float]:
-    """From unit triangles to clip space and to depth, both in units of the scene's scale.
+    """From unit triangles to clip space and to depth, both in units of the scene's radius.
 
     Then the largest depth in the scene. Clip space's y points down, as an image's does, so
     that the framebuffer's first row is the top one. Its z is 0 in perspective: there is no near
     plane but the eye, and the fragments' own depth decides what is in front.
     """
     rotation, eye = view.world_from_camera[:3, :3], view.world_from_camera[:3, 3]
-    offset = rotation.T @ (scene.centre - eye) / scene.scale
+    offset = rotation.T @ (scene.center - eye) / scene.radius
     x, y, depth = np.column_stack([rotation.T, offset])
     one = np.array([0.0, 0.0, 0.0, 1.0])
-    box = (scene.bounds - scene.centre) / scene.scale
+    box = (scene.bounds - scene.center) / scene.radius
     farthest = 1.0001 * float(np.maximum(*(box * depth[:3])).sum() + depth[3])
     if view.perspective:
         w, z = depth, 0 * depth
         u, v, _ = view.intrinsics @ np.stack([x, y, depth])
     else:
         w, z = one, 2 * depth / max(farthest, 1e-30) - one
-        u, v, _ = view.intrinsics @ np.stack([x * scene.scale, y * scene.scale, one])
+        u, v, _ = view.intrinsics @ np.stack([x * scene.radius, y * scene.radius, one])
     return np.stack([2 / width * u - w, 2 / height * v - w, z, w]), depth, farthest
 
 

@@ -24,7 +24,7 @@ def problem() -> str | None:
 
 
 _NUDGE = 1 / 512  # pixels; a rasteriser's own grid is some 1/256
-_INSET = 1e-4  # of the scene's scale, off the surfaces that a way begins and ends on
+_INSET = 1e-4  # of the scene's radius, off the surfaces that a way begins and ends on
 _built: weakref.WeakKeyDictionary[Scene, Any] = weakref.WeakKeyDictionary()
 
 
@@ -45,9 +45,9 @@ def first_faces(
     pixel = np.flatnonzero(np.isfinite(start))
     origins, directions = (each.take(pixel, axis=1) for each in view.rays(*start.shape))
     begin = view.to_world(origins + start.take(pixel) * directions)
-    unit = (begin - scene.centre[:, None]) / scene.scale
+    unit = (begin - scene.center[:, None]) / scene.radius
     faces = np.full(start.shape, -1, np.int32)
-    faces.flat[pixel] = _accelerated(scene).run(
+    faces.flat[pixel] = accelerated(scene).run(
         np.ascontiguousarray(unit.T, np.float32),
         np.ascontiguousarray(view.turn(directions).T, np.float32),
     )
@@ -60,11 +60,11 @@ def unobstructed(
     end: Float[np.ndarray, "ray 3"],
 ) -> Bool[np.ndarray, " ray"]:
     """Whether nothing stands between the ends, which may lie on surfaces themselves."""
-    start, end = ((each - scene.centre) / scene.scale for each in (start, end))
+    start, end = ((each - scene.center) / scene.radius for each in (start, end))
     way = end - start
     length = np.linalg.norm(way, axis=1, keepdims=True)
     inset = np.minimum(_INSET, length / 4) * way / np.where(length > 0, length, 1)
-    hits = _accelerated(scene).run(
+    hits = accelerated(scene).run(
         np.ascontiguousarray(start + inset, np.float32),
         np.ascontiguousarray(way - 2 * inset, np.float32),
         dists=np.ones(len(way), np.float32),
@@ -73,7 +73,11 @@ def unobstructed(
     return hits < 0
 
 
-def _accelerated(scene: Scene) -> Any:
+def accelerated(scene: Scene) -> Any:
+    """The scene's triangles in Embree's tree, built once per scene: `.run` casts rays.
+
+    Coordinates are those of `Scene.unit_triangles`.
+    """
     if scene not in _built:
         with needs("scene"):
             from embreex.mesh_construction import TriangleMesh
