@@ -506,7 +506,7 @@ def test_no_function_is_forgotten():
     """Every public function of arrays, and every type of ours, has its good call."""
     host = {"scene", "exr", "io", "tradeoff"}
     records = {"Plan", "Accumulation", "Choice", "Hit", "Receivers", "Candidates", "Lens"}
-    records |= {"Filled"}
+    records |= {"Filled", "Projection", "Rays"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.io.srgb import linear_from_srgb, log_profile, recolor, srgb_from_linear

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_numpy
 from jaxfx._files import StrPath
 

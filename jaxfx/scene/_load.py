@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 
 from jaxfx._extras import MissingExtraError, needs
-from jaxfx.scene import _gltf, _obj, _off, _ply, _trimesh
-from jaxfx.scene._gltf_data import is_glb
 from jaxfx.scene._part import UnreadableError, assemble
 from jaxfx.scene._scene import Scene
+from jaxfx.scene.formats import by_trimesh, gltf, obj, off, ply
+from jaxfx.scene.formats._gltf_document import is_glb
 
 
 _logger = logging.getLogger("jaxfx.scene")
 _READERS = {
-    ".gltf": _gltf,
-    ".glb": _gltf,
-    ".obj": _obj,
-    ".ply": _ply,
-    ".off": _off,
+    ".gltf": gltf,
+    ".glb": gltf,
+    ".obj": obj,
+    ".ply": ply,
+    ".off": off,
 }
 
 
@@ -53,7 +53,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
     file = Path(name)
     try:
         data = file.read_bytes()
-        reader = _gltf if is_glb(data) else _READERS.get(file.suffix.lower(), _trimesh)
+        reader = gltf if is_glb(data) else _READERS.get(file.suffix.lower(), by_trimesh)
         with np.errstate(all="ignore"):  # what comes of it is not finite, and found
             parts, ignored = reader.read(file, data)
     except MissingExtraError:
@@ -99,7 +99,7 @@ def from_trimesh(mesh: Any, *, smooth: bool | None = None) -> Scene:
             f"got {type(mesh).__name__}."
         )
     try:
-        parts = list(_trimesh.parts(mesh, smooth=smooth))
+        parts = list(by_trimesh.parts(mesh, smooth=smooth))
     except UnreadableError as error:
         raise ValueError(f"`scene.from_trimesh(mesh)` can't be taken over: {error}.") from error
     return assemble(parts, "scene.from_trimesh(mesh)")

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._arguments import check_camera, check_gbuffer
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_numpy, whole_number
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera

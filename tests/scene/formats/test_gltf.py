@@ -410,7 +410,7 @@ BROKEN = {
     ),
     "two parents": (
         lambda d: d.update(nodes=[{"children": [2]}, {"children": [2]}, {"mesh": 0}]),
-        "node 2 is twice a child",
+        "node 2 is listed as a child twice",
     ),
     "no affine matrix": (lambda d: d.update(nodes=[{"mesh": 0, "matrix": [1] * 16}]), "affine"),
     "no unit rotation": (
@@ -439,7 +439,7 @@ BROKEN = {
     "an image that is not there": (lambda d: d["images"][0].update(uri="gone.png"), "gone.png"),
     "an image by an extension": (
         lambda d: d.update(textures=[{"extensions": {"KHR_texture_basisu": {"source": 0}}}]),
-        "KHR_texture_basisu alone",
+        "held by KHR_texture_basisu",
     ),
     "gloss alone": (
         lambda d: d.update(

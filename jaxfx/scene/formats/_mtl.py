@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfx.io import linear_from_srgb
-from jaxfx.scene._images import find_file, read_image
 from jaxfx.scene._material import Material, Sampler
-from jaxfx.scene._part import UnreadableError
+from jaxfx.scene._part import UNASSIGNED, UnreadableError
+from jaxfx.scene.formats._images import find_file, read_image
 
 
-PLAIN = Material(color=(0.8, 0.8, 0.8))
 _READ = {"kd", "ks", "ns", "illum", "map_kd"}
 # Not used, and written by exporters of every material.
 _QUIET = {"ka", "tf", "ni", "sharpness", "tr", "d", "ke", "km"}
@@ -70,7 +69,7 @@ class Library:
         if "kd" in record:
             color = tuple(linear_from_srgb(_color(record, "kd")).tolist())
         else:
-            color = (1.0, 1.0, 1.0) if "map_kd" in record else PLAIN.color
+            color = (1.0, 1.0, 1.0) if "map_kd" in record else UNASSIGNED.color
         shines = "ks" in record and _color(record, "ks").any()
         if "illum" in record:
             shines = shines and _numbers(record["illum"], "illum", 1, 1)[0] not in (0, 1)

@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from jaxfx.io import linear_from_srgb
 from jaxfx.scene._material import Material
-from jaxfx.scene._mtl import PLAIN
-from jaxfx.scene._part import Part, UnreadableError, unit
-from jaxfx.scene._polygons import triangulate
+from jaxfx.scene._part import UNASSIGNED, Part, UnreadableError, unit
+from jaxfx.scene.formats._polygons import triangulate
 
 
 _Words = list[str]
@@ -81,7 +80,7 @@ def _part(
     if "uv" in vertex:
         uv = np.array(vertex["uv"], np.float64)[faces]
     none = np.zeros(len(faces), np.intp)
-    material = PLAIN if colors is None else Material()
+    material = UNASSIGNED if colors is None else Material()
     part = Part(vertices, faces, [material], none, [name], none, normals, uv, None, colors)
     return [part], ignored
 

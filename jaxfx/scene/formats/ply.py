@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from jaxfx.io import linear_from_srgb
-from jaxfx.scene._images import find_file, read_image
 from jaxfx.scene._material import Material
-from jaxfx.scene._mtl import PLAIN
-from jaxfx.scene._part import Part, UnreadableError, unit
-from jaxfx.scene._polygons import triangulate
+from jaxfx.scene._part import UNASSIGNED, Part, UnreadableError, unit
+from jaxfx.scene.formats._images import find_file, read_image
+from jaxfx.scene.formats._polygons import triangulate
 
 
 _TYPES = {
@@ -236,7 +235,7 @@ def _part(
     normals = vertex.stacked(("nx", "ny", "nz"))
     if uv is not None:
         uv = uv[at] if len(uv) == len(corners) and "texcoord" in face.lists else uv[faces]
-    plain = PLAIN if colors is None else Material()
+    plain = UNASSIGNED if colors is None else Material()
     materials, chosen = [plain], np.zeros(len(faces), np.intp)
     if images and uv is None:
         raise UnreadableError("it names a texture, and has no texture coordinates")

@@ -9,10 +9,9 @@ from jaxtyping import Float, Int
 
 from jaxfx._extras import needs
 from jaxfx.io import linear_from_srgb
-from jaxfx.scene._images import pillow_codes
 from jaxfx.scene._material import Material
-from jaxfx.scene._mtl import PLAIN
-from jaxfx.scene._part import Part, UnreadableError, placed
+from jaxfx.scene._part import UNASSIGNED, Part, UnreadableError, placed
+from jaxfx.scene.formats._images import pillow_codes
 
 
 _ARCHIVES = (".zip", ".gz", ".bz2", ".xz", ".tar", ".tgz")
@@ -139,12 +138,12 @@ def _materials(mesh: Any) -> tuple[list[Material], Int[np.ndarray, " face"]]:
     index = np.zeros(len(mesh.faces), np.int64)
     material = getattr(mesh.visual, "material", None)
     if material is None:
-        return [Material() if _kind(mesh) in ("face", "vertex") else PLAIN], index
+        return [Material() if _kind(mesh) in ("face", "vertex") else UNASSIGNED], index
     if not isinstance(material, MultiMaterial):
         return [_material(mesh, material)], index
     found = [_material(mesh, each) for each in material.materials]
     chosen = mesh.visual.face_materials
-    return found or [PLAIN], index if chosen is None else np.asarray(chosen, np.int64)
+    return found or [UNASSIGNED], index if chosen is None else np.asarray(chosen, np.int64)
 
 
 def _material(mesh: Any, material: Any) -> Material:
@@ -178,7 +177,7 @@ def _simple(material: Any, has_uv: bool) -> Material:
     if given is not None:
         color = tuple(linear_from_srgb(np.clip(np.asarray(given, float)[:3], 0, 1)).tolist())
     else:
-        color = PLAIN.color if texture is None else (1.0, 1.0, 1.0)
+        color = UNASSIGNED.color if texture is None else (1.0, 1.0, 1.0)
     shines = not _is_default(material.specular) and np.any(material.specular[:3])
     exponent = max(material.glossiness, 0.0) if shines else 0.0
     return Material(color=color, texture=texture, roughness=(2 / (exponent + 2)) ** 0.5)

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfx.io import linear_from_srgb
-from jaxfx.scene._images import find_file
 from jaxfx.scene._material import Material
-from jaxfx.scene._mtl import PLAIN, Library
-from jaxfx.scene._part import Part, UnreadableError, flat_normals, unit
-from jaxfx.scene._polygons import triangulate
+from jaxfx.scene._part import UNASSIGNED, Part, UnreadableError, flat_normals, unit
+from jaxfx.scene.formats._images import find_file
+from jaxfx.scene.formats._mtl import Library
+from jaxfx.scene.formats._polygons import triangulate
 
 
 _QUIET = {"mg", "bevel", "c_interp", "d_interp", "lod"}
@@ -241,13 +241,13 @@ class _Reader:
             return self.library.get(name, has_uv=has_uv)
         if not name:
             colored = any(len(row) > 4 for row in self.points["v"])
-            return Material() if colored else PLAIN
+            return Material() if colored else UNASSIGNED
         if self.missing:
             raise UnreadableError(f"material {name!r} is in none of the files {self.missing}")
         if self.names_libraries:
             raise UnreadableError(f"no mtllib has the material {name!r}")
         self.ignored.add("usemtl without any mtllib")
-        return PLAIN
+        return UNASSIGNED
 
 
 def _angles(corners: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3"]:
