@@ -5,13 +5,13 @@ that every pixel shows; NumPy does the rest. World axes are the mesh file's own 
 them); cameras are this package's.
 """
 
+from jaxfx.scene._defaults import default_camera, default_lights
 from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._material import Material, Sampler
 from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Scene, Viewpoint
 from jaxfx.scene._still_life import still_life
 from jaxfx.scene._transfer import transfer, visible
-from jaxfx.scene._view import default_camera, default_lights
 
 
 __all__ = [

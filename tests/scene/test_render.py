@@ -98,7 +98,7 @@ def test_bad_scenes_and_cameras(ball, view, monkeypatch):
     with pytest.raises(ValueError, match="must be finite"):
         scene.depth(ball, broken, **SIZE)
     flat = changed(0.0)
-    with pytest.raises(ValueError, match="an inverse"):
+    with pytest.raises(ValueError, match="invertible"):
         scene.depth(ball, flat, **SIZE)
     with pytest.raises(ValueError, match="must be concrete, got a traced camera"):
         jax.jit(lambda c: scene.depth(ball, c, **SIZE))(view)
@@ -119,4 +119,4 @@ def test_a_place_that_is_rounded_is_said(backend, caplog):
     assert not caplog.records
     draw(PinholeCamera(focal.astype(np.float32), pose.astype(np.float32)))
     (record,) = caplog.records
-    assert "the camera's place is rounded to 0.12 in float32" in record.getMessage()
+    assert "the camera's position is rounded to 0.12 in float32" in record.getMessage()
