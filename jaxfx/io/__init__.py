@@ -1,7 +1,16 @@
-"""Images in files: colour into linear light, depth as the numbers that a file stores.
+"""Image files: colour in linear light, depth as the numbers that a file stores.
 
-The file boundary, on the host: NumPy in and out. The sRGB curve exists only here. Layers of
-OpenEXR files are `jaxfx.exr`'s.
+| I want | call |
+|---|---|
+| an image from PNG, JPEG or EXR | `read_color` |
+| a depth or disparity from PNG, EXR, PFM, NPY or NPZ | `read_depth`, then `jaxfx.depth` |
+| an 8-bit PNG to look at | `write_png` |
+| PNG alone | `read_png` |
+| to show linear light with another library | `srgb_from_linear` |
+| linear light from 8-bit numbers in memory | `linear_from_srgb` |
+| full range, several layers, or a G-buffer with its camera | `jaxfx.exr` |
+
+This runs on the host: NumPy arrays in and out.
 """
 
 from jaxfx.io.color import read_color

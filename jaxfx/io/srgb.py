@@ -15,20 +15,27 @@ from jaxfx._checks import as_numpy
 from jaxfx._files import StrPath
 
 
-# How a colour profile names sRGB, in its two versions.
+# How colour profiles name sRGB: as text in version 2 of the format, as UTF-16 in version 4.
 _SRGB = (b"sRGB", "sRGB".encode("utf-16-be"))
 
 
 def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The sRGB curve: from linear light to what a screen is sent.
+    """The sRGB curve: from linear light to the numbers that screens and files take.
 
     **Arguments:** `linear`: any shape; 0 is black, 1 the screen's white.
 
-    **Returns:** the same type and shape, not clipped: outside [0, 1] the curve goes on.
+    **Returns:** the same type and shape. Outside [0, 1] the curve continues, unclipped.
 
     **Raises:** `ValueError` for integers.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import io
+    >>> print(io.srgb_from_linear(np.array([0.0, 0.18, 1.0])).round(3))
+    [0.    0.461 1.   ]
 
     Source: IEC 61966-2-1, the piecewise curve.
     """
@@ -39,15 +46,22 @@ def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*
 
 
 def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The inverse of `srgb_from_linear`.
+    """Linear light from sRGB numbers: the inverse of `srgb_from_linear`.
 
     **Arguments:** `srgb`: any shape, 0 to 1.
 
     **Returns:** linear light, the same type and shape, not clipped.
 
-    **Raises:** `ValueError` for integers: 8-bit numbers are to be divided by 255 first.
+    **Raises:** `ValueError` for integers: divide 8-bit numbers by 255 first.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import io
+    >>> print(io.linear_from_srgb(np.array([0, 128, 255]) / 255).round(3))
+    [0.    0.216 1.   ]
 
     Source: IEC 61966-2-1, the piecewise curve.
     """
@@ -58,7 +72,7 @@ def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*sh
 
 
 def _floats(name: str, values: Any) -> tuple[np.ndarray, np.dtype]:
-    """Numbers to compute a curve of, in float32 at least, and their own type."""
+    """`values` in float32 or wider, to compute with, and their own type for the result."""
     array = as_numpy(name, values)
     if array.dtype.kind in "biu":
         raise ValueError(
@@ -69,16 +83,16 @@ def _floats(name: str, values: Any) -> tuple[np.ndarray, np.dtype]:
 
 
 def recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
-    """`curve` on the colours of an image, not on its alpha."""
+    """An image, height width channel, with `curve` applied to its colours but not to alpha."""
     colors = 3 if values.shape[2] > 2 else 1
     return np.concatenate([curve(values[:, :, :colors]), values[:, :, colors:]], axis=2)
 
 
-def log_profile(path: StrPath, facts: Mapping[Any, Any]) -> None:
-    """Say that a colour profile is not heeded, where it is another than sRGB."""
-    profile = facts.get("icc_profile") or b""
+def log_profile(path: StrPath, info: Mapping[Any, Any]) -> None:
+    """Log a warning where a file has a colour profile other than sRGB, which is not applied."""
+    profile = info.get("icc_profile") or b""
     if profile and not any(name in profile for name in _SRGB):
         logging.getLogger("jaxfx").warning(
-            "`%s` has a colour profile that is not heeded: its numbers are taken for sRGB.",
+            "`%s` has a colour profile that is not applied: its numbers are taken for sRGB.",
             path,
         )
