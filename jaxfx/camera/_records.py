@@ -1,4 +1,4 @@
-"""The results of a camera's methods that hold two things."""
+"""Records that cameras' methods return."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 
 class Rays(NamedTuple):
-    """The rays through the pixels' centres, in the world's axes.
+    """Rays through the pixels' centres, in world axes: what `rays` of a camera returns.
 
     - `origins`: height width 3, in scene units.
     - `directions`: height width 3, unit vectors.
@@ -17,7 +17,7 @@ class Rays(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """Where a camera shows world points.
+    """World points in an image: what `project` of a camera returns.
 
     - `pixels`: `... 2`, (x, y), with centres at +0.5.
     - `depth`: `...`, along the optical axis, in scene units.

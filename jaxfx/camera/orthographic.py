@@ -1,4 +1,4 @@
-"""The camera whose rays are parallel."""
+"""The orthographic camera."""
 
 from typing import Any, ClassVar, final
 
@@ -28,7 +28,9 @@ from jaxfx.camera._rigid import (
 
 @final
 class OrthographicCamera(eqx.Module):
-    """A camera whose rays are parallel: a directional light's, say.
+    """A camera with parallel rays: the camera of a directional light's shadow map, say.
+
+    `shadow.light_cameras` makes one for a light.
 
     **Arguments:**
 
@@ -40,6 +42,14 @@ class OrthographicCamera(eqx.Module):
     positive, or a pose that is not rigid.
 
     **Gradient:** exact with respect to every field.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera
+    >>> camera = OrthographicCamera(4.0, (4.0, 3.0), jnp.eye(4))
+    >>> print(camera.project((0.5, 0.0, 2.0)).pixels)
+    [6. 3.]
     """
 
     SHAPES: ClassVar = {"pixels_per_unit": (), "center": (2,), "world_from_camera": (4, 4)}
@@ -61,14 +71,23 @@ class OrthographicCamera(eqx.Module):
     def rays(self, *, height: WholeNumber, width: WholeNumber) -> Rays:
         """The ray through each pixel's centre.
 
-        **Arguments:** `height`, `width`: static; the picture's size in pixels.
+        **Arguments:** `height`, `width`: static; the image's size in pixels.
 
-        **Returns:** origins at depth 0, in scene units, and unit directions, all the optical
-        axis; height width 3 each, in the world's axes, in the type of `center`.
+        **Returns:** `Rays(origins, directions)`: origins at depth 0, in scene units, and unit
+        directions, all along the optical axis; height width 3 each, in world axes, in the type
+        of `center`.
 
         **Raises:** `ValueError` for a size that is no positive integer, or a batch of cameras.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import OrthographicCamera
+        >>> camera = OrthographicCamera(4.0, (4.0, 3.0), jnp.eye(4))
+        >>> print(camera.rays(height=6, width=8).directions[0, 0])
+        [0. 0. 1.]
         """
         check_fields("OrthographicCamera.rays", self)
         size = (
@@ -83,32 +102,50 @@ class OrthographicCamera(eqx.Module):
         return Rays(origins.astype(dtype), directions.astype(dtype))
 
     def points(self, depth: DepthMap) -> Float[Array, "height width 3"]:
-        """What every pixel of a depth image shows: the world point at its centre.
+        """The world point that each pixel of a depth image shows, at the pixel's centre.
 
         **Arguments:** `depth`: height width, scene units along the optical axis.
 
-        **Returns:** world positions, height width 3, in the type of `depth`, of integers in
+        **Returns:** world positions, height width 3, in the type of `depth`, for integers in
         JAX's default float type. Where the depth is inf they are not finite.
 
         **Raises:** `ValueError` for a wrong shape, or a batch of cameras.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import OrthographicCamera
+        >>> camera = OrthographicCamera(4.0, (4.0, 3.0), jnp.eye(4))
+        >>> camera.points(jnp.full((6, 8), 2.0)).shape
+        (6, 8, 3)
         """
         pixels, depth, dtype = read_map(depth)
         return self.unproject(pixels, depth).astype(dtype)
 
     def project(self, points: Points) -> Projection:
-        """Pixels and depth of world points.
+        """The pixels and depths of world points.
 
         **Arguments:** `points`: world positions, `... 3`, in scene units, floats or integers.
 
-        **Returns:** `pixels`, `... 2`, (x, y); `depth`, `...`, along the optical axis; both in
-        the type of `points`, of integers in JAX's default float type.
+        **Returns:** `Projection(pixels, depth)`: `pixels`, `... 2`, are (x, y) with centres at
+        +0.5; `depth`, `...`, is along the optical axis; both in the type of `points`, for
+        integers in JAX's default float type.
 
         **Raises:** `ValueError` for a wrong shape, what is no array of numbers, or a batch of
         cameras.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import OrthographicCamera
+        >>> camera = OrthographicCamera(4.0, (4.0, 3.0), jnp.eye(4))
+        >>> pixels, depth = camera.project((0.5, 0.0, 2.0))
+        >>> print(pixels, depth)
+        [6. 3.] 2.0
         """
         points = read_points(self, "project", points, 3)
         dtype = points.dtype
@@ -118,17 +155,25 @@ class OrthographicCamera(eqx.Module):
         return Projection(pixels.astype(dtype), local[..., 2].astype(dtype))
 
     def unproject(self, pixels: Pixels, depth: Depths) -> Float[Array, "... 3"]:
-        """World points of pixels at a depth: the inverse of `project`.
+        """World points of pixels at given depths: the inverse of `project`.
 
         **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis;
-        floats or integers, one depth for several pixels or the other way round.
+        floats or integers, which broadcast.
 
-        **Returns:** world positions, `... 3`, in the wider type of the two, of integers in
+        **Returns:** world positions, `... 3`, in the wider type of the two, for integers in
         JAX's default float type.
 
         **Raises:** `ValueError` as `project`, and for a depth that does not fit the pixels.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import OrthographicCamera
+        >>> camera = OrthographicCamera(4.0, (4.0, 3.0), jnp.eye(4))
+        >>> print(camera.unproject((6.0, 3.0), 2.0))
+        [0.5 0.  2. ]
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
         plane = pixels - each(self.center, pixels)
