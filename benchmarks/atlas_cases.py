@@ -110,7 +110,7 @@ def view(name: str, side: int):
     lights, shade = scene.default_lights(camera), jax.jit(relight.render)
 
     def render(eye, layer=0):
-        gbuffer = scene.gbuffer(mesh, eye, height=side, width=side, layer=layer)
+        gbuffer = scene.gbuffer(mesh, eye, height=side, width=side, layer_index=layer)
         return shade(gbuffer, eye, lights), gbuffer
 
     return camera, *render(camera), render
@@ -413,7 +413,7 @@ def relit(at: Point) -> Case:
 def transfer(name: str, side: int):
     """How light goes by way of 256 points, with every singular vector."""
     camera, _, gbuffer, _ = view(name, side)
-    return scene.transfer(mesh_of(name), gbuffer, camera, points=256, rank=256)
+    return scene.transfer(mesh_of(name), gbuffer, camera, point_count=256, rank=256)
 
 
 def bounced(at: Point) -> Case:

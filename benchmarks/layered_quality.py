@@ -37,7 +37,7 @@ class Case:
         self.image = self.through(self.lens(0.0, 1.0), 16)
 
     def layer(self, eye, layer=0):
-        seen = scene.gbuffer(self.mesh, eye, **self.size, layer=layer)
+        seen = scene.gbuffer(self.mesh, eye, **self.size, layer_index=layer)
         return self.shade(seen, eye, self.lights), seen.depth
 
     def lens(self, aperture, focus):

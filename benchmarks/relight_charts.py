@@ -65,7 +65,7 @@ def bounce(mesh, camera, gbuffer, path):
     rows, images = [], {}
     for points in POINTS:
         most = min(points, 1024)
-        full = scene.transfer(mesh, gbuffer, camera, points=points, rank=most)
+        full = scene.transfer(mesh, gbuffer, camera, point_count=points, rank=most)
         lit = truth.unshadowed(mesh, full.position, light)
         send = lambda rank, full=full, lit=lit: np.asarray(
             relight.indirect(gbuffer, truncated(full, rank), [light], lit=[lit])

@@ -109,7 +109,7 @@ def set_stage(path: Path | None, height: int) -> Stage:
     try:
         mesh = scene.still_life() if path is None else scene.load(path)
         camera = scene.default_camera(mesh, height=height, width=width)
-        middle = mesh.centre if mesh.viewpoint is None else np.array(mesh.viewpoint.target)
+        middle = mesh.center if mesh.viewpoint is None else np.array(mesh.viewpoint.at)
         stage = Stage(mesh, camera, middle, height, width)
         stage.gbuffer(camera)
     except (OSError, ValueError, RuntimeError) as error:
@@ -148,7 +148,7 @@ def visibility(stage: Stage, gbuffer, camera, light: SpotLight):
         width=MAP_SIZE,
     )
     shadow_map = scene.depth(stage.mesh, light_camera, height=MAP_SIZE, width=MAP_SIZE)
-    return filtered(gbuffer, camera, shadow_map, light_camera, 2e-3 * stage.mesh.scale)
+    return filtered(gbuffer, camera, shadow_map, light_camera, 2e-3 * stage.mesh.radius)
 
 
 @jax.jit

@@ -1,7 +1,7 @@
-"""Arguments of the package's own types: of the right kind, and one, not a batch of them.
+"""Checks of arguments that are cameras, lenses, lights or caches: the right type, and no batch.
 
-A camera, lens or light whose fields have a leading axis is a batch. `jax.vmap` takes it apart;
-without that its fields would be broadcast against an image's rows and columns without a word.
+A camera, lens or light whose fields have a leading axis is a batch. Without `jax.vmap` its
+fields would be broadcast against an image's rows and columns, and no error raised.
 """
 
 from typing import Any, get_args
@@ -16,16 +16,16 @@ from jaxfx.light import Light
 
 
 def check_camera(name: str, camera: Any, kind: Any = Camera) -> None:
-    """Raise `ValueError` for anything but one camera of a kind."""
+    """Raise `ValueError` unless `camera` is a single camera of the type, or union, `kind`."""
     if not isinstance(camera, kind):
-        kinds = " or ".join(f"a {each.__name__}" for each in get_args(kind) or (kind,))
+        kinds = " or ".join(f"a {cls.__name__}" for cls in get_args(kind) or (kind,))
         kinds = kinds.replace("a O", "an O")
         raise ValueError(f"`{name}` must be {kinds}, got {type(camera).__name__}.")
     check_fields(name, camera)
 
 
 def check_lens(name: str, lens: Any) -> None:
-    """Raise `ValueError` for anything but one lens."""
+    """Raise `ValueError` unless `lens` is a single lens."""
     if isinstance(lens, type) or not isinstance(lens, Lens):
         raise ValueError(
             f"`{name}` must be a lens, with `defocus(depth)`, `circle_of_confusion(depth)` and "
@@ -37,23 +37,23 @@ def check_lens(name: str, lens: Any) -> None:
 
 
 def check_light(name: str, light: Any, kind: Any = Light) -> None:
-    """Raise `ValueError` for anything but one light of a kind."""
+    """Raise `ValueError` unless `light` is a single light of the type, or union, `kind`."""
     if not isinstance(light, kind):
-        kinds = ", ".join(each.__name__ for each in get_args(kind) or (kind,))
+        kinds = ", ".join(cls.__name__ for cls in get_args(kind) or (kind,))
         raise ValueError(f"`{name}` must be one of {kinds}, got {type(light).__name__}.")
     check_fields(name, light)
 
 
 def check_lights(name: str, lights: Any) -> tuple[Light, ...]:
-    """The lights of a sequence; `ValueError` names what is none."""
-    found = items(name, lights, "a sequence of lights")
-    for index, light in enumerate(found):
+    """The lights of a sequence; `ValueError` names the item that is not a single light."""
+    sequence = items(name, lights, "a sequence of lights")
+    for index, light in enumerate(sequence):
         check_light(f"{name[:-1]}[{index}])", light)
-    return tuple(found)
+    return tuple(sequence)
 
 
 def check_gbuffer(name: str, gbuffer: Any) -> GBuffer:
-    """The cache, built again: it may have been edited as a pytree. `ValueError` otherwise."""
+    """The G-buffer, with its shapes checked again: it may have been edited as a pytree."""
     if not isinstance(gbuffer, GBuffer):
         raise ValueError(f"`{name}` must be a GBuffer, got {type(gbuffer).__name__}.")
     return GBuffer(*jax.tree.leaves(gbuffer))

@@ -1,7 +1,8 @@
-"""The checks of arguments: read as an array or a number, or refused by name.
+"""Checks of arguments: each becomes an array or a number, or a `ValueError` names it.
 
-`as_array` reads every array of the public face, whoever made it; `parameter`, `check_image` and
-`check_depth` ask more of it. `whole_number`, `number` and `option` read what is static.
+Every public function converts its arrays by `as_array`, or by `parameter`, `check_image` or
+`check_depth`, which check more. `whole_number`, `number` and `option` read static arguments.
+The first parameter, `name`, is the argument's name in errors: "scatter(max_coc=...)".
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -14,18 +15,19 @@ import numpy as np
 from jaxtyping import Array
 
 
-# Static numbers as people have them, Python's and NumPy's.
+# Static numbers, of Python or NumPy.
 WholeNumber = int | np.integer
 Number = int | float | np.integer | np.floating
-# A share may pass 0 and 1 by so much: a filter that made it rounds.
+# How far a visibility may lie outside [0, 1]: filters that compute one round. With 0 such a
+# result would be refused; a large tolerance would hide values of another unit.
 _ROUNDING = 1e-3
-# An array of more numbers is not shown in full.
-_SHOWN = 16
+# Errors show an array of at most this many numbers in full, of a larger one a wrong entry.
+_MAX_SHOWN = 16
 _SCALARS = np.generic | np.ndarray | jax.Array
 
 
 def is_concrete(*values: Any) -> bool:
-    """Whether the numbers behind `values` can be looked at now, outside any transform."""
+    """Whether all arrays in `values` have values now: none of them is traced."""
     leaves = jax.tree.leaves(values)
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
@@ -33,26 +35,27 @@ def is_concrete(*values: Any) -> bool:
 def as_array(name: str, value: Any) -> Array:
     """`value` as an array of real numbers or booleans, in its own type.
 
-    Bytes in another machine's order are turned round, which changes no number. `ValueError`
-    names what is no array, and what would lose numbers on the way.
+    Its byte order becomes this machine's. `ValueError` where it is no array, or holds integers
+    that JAX's integer type can't.
     """
-    array = value if isinstance(value, jax.Array) else _from_outside(name, value)
+    array = value if isinstance(value, jax.Array) else _to_numpy(name, value)
     kinds = (jnp.bool_, jnp.integer, jnp.floating)
     if not any(jnp.issubdtype(array.dtype, kind) for kind in kinds):
         raise _not_real(name, array)
-    read = _converted(array)
-    if jnp.issubdtype(read.dtype, jnp.integer) and read.dtype.itemsize < array.dtype.itemsize:
-        held = np.iinfo(read.dtype)
-        if array.size and not held.min <= array.min() <= array.max() <= held.max:
+    result = _to_jax(array)
+    dtype = result.dtype
+    if jnp.issubdtype(dtype, jnp.integer) and dtype.itemsize < array.dtype.itemsize:
+        limits = np.iinfo(dtype)
+        if array.size and not limits.min <= array.min() <= array.max() <= limits.max:
             raise ValueError(
-                f"`{name}` must hold numbers that {read.dtype} has, got {array.dtype} from "
+                f"`{name}` must hold numbers that {dtype} has, got {array.dtype} from "
                 f"{array.min()} to {array.max()}."
             )
-    return read
+    return result
 
 
-def _converted(array: Any, dtype: Any = None) -> Array:
-    """A JAX array of a type; of what can be looked at one that can be, inside a trace too."""
+def _to_jax(array: Any, dtype: Any = None) -> Array:
+    """`array` as a JAX array; a concrete one stays concrete, inside a trace too."""
     if not is_concrete(array):
         return jnp.asarray(array, dtype)
     with jax.ensure_compile_time_eval():
@@ -60,20 +63,21 @@ def _converted(array: Any, dtype: Any = None) -> Array:
 
 
 def as_numpy(name: str, value: Any) -> np.ndarray:
-    """What `as_array` reads, on the host and in full: for files."""
-    array = np.asarray(value if isinstance(value, jax.Array) else _from_outside(name, value))
+    """`value` as a NumPy array of its own type, checked as by `as_array`: for files."""
+    array = np.asarray(value if isinstance(value, jax.Array) else _to_numpy(name, value))
     if array.dtype.kind == "c":
         raise _not_real(name, array)
     return array
 
 
 def _not_real(name: str, array: Any) -> ValueError:
-    what = "hold real numbers" if array.ndim else "be a real number"
-    return ValueError(f"`{name}` must {what}, got {array.dtype}.")
+    """The error for an array, or a scalar, whose type is not real."""
+    expected = "hold real numbers" if array.ndim else "be a real number"
+    return ValueError(f"`{name}` must {expected}, got {array.dtype}.")
 
 
-def _from_outside(name: str, value: Any) -> Any:
-    """What is no JAX array yet, as one of NumPy, or of JAX where it is made of such."""
+def _to_numpy(name: str, value: Any) -> Any:
+    """A value that is no JAX array, as a NumPy array; a list of JAX arrays as a JAX array."""
     if isinstance(value, Mapping):
         raise ValueError(
             f"`{name}` must be one array, got a {type(value).__name__} with the keys "
@@ -83,7 +87,7 @@ def _from_outside(name: str, value: Any) -> Any:
         raise ValueError(f"`{name}` must be an array, got {value!r:.40}.")
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(
-            f"`{name}` must have a number everywhere, got a masked array. Fill what is masked "
+            f"`{name}` must have a number everywhere, got a masked array. Fill masked entries "
             "by `array.filled(number)`: a missing depth is 0 or NaN."
         )
     kind = type(value).__name__
@@ -103,20 +107,20 @@ def _from_outside(name: str, value: Any) -> Any:
 def parameter(
     name: str, value: Any, shape: tuple[int, ...] | None = (), *, booleans: bool = False
 ) -> Array:
-    """`value` as a strongly typed float array of `shape`; `ValueError` names it otherwise.
+    """`value` as a strongly typed float array of `shape`; `ValueError` otherwise.
 
-    Python numbers and integers take JAX's default float type; a float array, traced or not,
-    keeps its own. Without a shape any will do. With `booleans` they are 0 and 1.
+    Python's numbers and integers become JAX's default float type; a float array, traced or not,
+    keeps its type. `shape=None` accepts any shape; with `booleans`, booleans become 0 and 1.
     """
     if not isinstance(value, jax.Array):
-        value = _from_outside(name, value)
-        if value.dtype.kind in "iu":  # Before JAX, which may not hold so large an integer.
+        value = _to_numpy(name, value)
+        if value.dtype.kind in "iu":  # Before JAX, whose integers may be smaller.
             value = value.astype(np.float64)
     array = as_array(name, value)
     if array.dtype == jnp.bool_ and not booleans:
         raise _not_real(name, array)
     if not jnp.issubdtype(array.dtype, jnp.floating) or array.weak_type:
-        array = _converted(array, jnp.result_type(float))
+        array = _to_jax(array, jnp.result_type(float))
     if shape is not None:
         check_shape(name, array, shape)
     return array
@@ -124,22 +128,22 @@ def parameter(
 
 def check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
     """Raise `ValueError` where an array has another shape."""
-    found = jnp.shape(array)
-    if found != shape:
-        batch = found[len(found) - len(shape) :] == shape
-        hint = " Batches are made with `jax.vmap`." if batch else ""
-        raise ValueError(f"`{name}` must have shape {shape}, got {found}.{hint}")
+    actual = jnp.shape(array)
+    if actual != shape:
+        is_batch = actual[len(actual) - len(shape) :] == shape
+        hint = " Batches are made with `jax.vmap`." if is_batch else ""
+        raise ValueError(f"`{name}` must have shape {shape}, got {actual}.{hint}")
 
 
 def check_fields(name: str, module: Any) -> None:
-    """Raise `ValueError` where a field of a camera, lens or light is that of several."""
+    """Raise `ValueError` where a camera, lens or light is a batch: by its fields' shapes."""
     for field, shape in module.SHAPES.items():
-        found = jnp.shape(getattr(module, field))
-        if found != shape:
+        actual = jnp.shape(getattr(module, field))
+        if actual != shape:
             kind = type(module).__name__
             raise ValueError(
                 f"`{name}` must be one {kind}, whose `{field}` has shape {shape}, "
-                f"got {found}. Batches are made with `jax.vmap`."
+                f"got {actual}. Batches are made with `jax.vmap`."
             )
 
 
@@ -148,17 +152,17 @@ def check(name: str, value: Array, valid: Callable[[Any], Any], expected: str) -
     if not is_concrete(value):
         return
     numbers = np.asarray(value)
-    wrong = ~np.broadcast_to(valid(numbers), numbers.shape)
-    if wrong.any():
+    is_wrong = ~np.broadcast_to(valid(numbers), numbers.shape)
+    if is_wrong.any():
         shown = " ".join(str(numbers).split())
-        if numbers.size > _SHOWN:
-            first = tuple(np.argwhere(wrong)[0].tolist())
-            shown = f"{numbers[first]} at {list(first)}, one of {wrong.sum()} that are wrong"
+        if numbers.size > _MAX_SHOWN:
+            first = tuple(np.argwhere(is_wrong)[0].tolist())
+            shown = f"{numbers[first]} at {list(first)}, one of {is_wrong.sum()} that are wrong"
         raise ValueError(f"`{name}` must be {expected}, got {shown}.")
 
 
 def share(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    """`value` as floats in [0, 1], booleans as 0 and 1; a NaN is left to its own pixel."""
+    """`value` as floats in [0, 1]: a visibility, say. Booleans become 0 and 1, NaN passes."""
     array = parameter(name, value, shape, booleans=True)
     valid = lambda v: ~((v < -_ROUNDING) | (v > 1 + _ROUNDING))
     check(name, array, valid, "in [0, 1]")
@@ -166,16 +170,17 @@ def share(name: str, value: Any, shape: tuple[int, ...]) -> Array:
 
 
 def shares(name: str, values: Any, count: int, shape: tuple[int, ...]) -> list[Array | None]:
-    """A share, or None, for each of some lights; None alone stands for None for each."""
-    found = [None] * count if values is None else items(name, values, "a sequence")
-    if len(found) != count:
-        what = "an image" if len(shape) == 2 else "numbers"
+    """One visibility, as by `share`, or None per light; None alone stands for all None."""
+    sequence = [None] * count if values is None else items(name, values, "a sequence")
+    if len(sequence) != count:
+        expected = "an image" if len(shape) == 2 else "numbers"
         raise ValueError(
-            f"`{name}` must hold {what} or None for each of {count} lights, got {len(found)}."
+            f"`{name}` must hold {expected} or None for each of {count} lights, "
+            f"got {len(sequence)}."
         )
     return [
-        each if each is None else share(f"{name}[{index}]", each, shape)
-        for index, each in enumerate(found)
+        None if value is None else share(f"{name}[{index}]", value, shape)
+        for index, value in enumerate(sequence)
     ]
 
 
@@ -190,13 +195,13 @@ def check_image(name: str, image: Any) -> Array:
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(
             f"`{name}` must hold floats (linear radiance), got {array.dtype}. Convert an "
-            "8-bit picture with `jaxfx.io.read_png`, which also undoes its sRGB curve."
+            "8-bit image with `jaxfx.io.read_png`, which also undoes its sRGB curve."
         )
     return array
 
 
 def check_map(name: str, depth: Any) -> Array:
-    """`depth` as a float array of two dimensions, neither 0; `ValueError` otherwise."""
+    """`depth` as a float array, height width, neither of them 0; `ValueError` otherwise."""
     array = parameter(name, depth, None)
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
@@ -207,9 +212,9 @@ def check_map(name: str, depth: Any) -> Array:
 
 
 def check_depth(name: str, depth: Any, shape: tuple[int, ...]) -> Array:
-    """`depth` as a float array of `shape`, of whatever values; `ValueError` otherwise.
+    """`depth` as a float array of `shape`; `ValueError` otherwise.
 
-    Positive is a depth, inf is background; 0, negative and NaN are missing.
+    Any value is accepted: inf is background; 0, negative and NaN are missing.
     """
     array = parameter(name, depth, None)
     if array.shape != shape:
@@ -220,7 +225,7 @@ def check_depth(name: str, depth: Any, shape: tuple[int, ...]) -> Array:
 
 
 def items(name: str, values: Any, expected: str = "a sequence of at least one") -> list[Any]:
-    """The items of a sequence, or of an array's first axis; `ValueError` otherwise."""
+    """The items of a sequence, or of an array along its first axis; `ValueError` otherwise."""
     is_array = isinstance(values, np.ndarray | jax.Array) and values.ndim > 0
     if not (is_array or (isinstance(values, Sequence) and not isinstance(values, str))):
         raise ValueError(f"`{name}` must be {expected}, got {type(values).__name__}.")
@@ -228,7 +233,7 @@ def items(name: str, values: Any, expected: str = "a sequence of at least one") 
 
 
 def option(name: str, value: Any, options: Sequence[str]) -> Any:
-    """One of some names; `ValueError` otherwise."""
+    """`value`, which must be one of the names `options`; `ValueError` otherwise."""
     if not isinstance(value, str) or value not in options:
         raise ValueError(f"`{name}` must be one of {tuple(options)}, got {value!r:.60}.")
     return value
@@ -240,11 +245,11 @@ def whole_number(
     valid: Callable[[int], bool] = lambda n: n >= 1,
     expected: str = "a positive integer",
 ) -> int:
-    """A static integer, of Python's or of NumPy's; `ValueError` names anything else."""
-    found = _static(name, value, expected)
-    if not isinstance(found, int) or not valid(found):
+    """A static integer of Python or NumPy that is `valid`; `ValueError` otherwise."""
+    scalar = _static(name, value, expected)
+    if not isinstance(scalar, int) or not valid(scalar):
         raise ValueError(f"`{name}` must be {expected}, got {value!r:.60}.")
-    return found
+    return scalar
 
 
 def number(
@@ -253,15 +258,15 @@ def number(
     valid: Callable[[float], bool] = lambda x: x > 0,
     expected: str = "positive",
 ) -> float:
-    """A static number, of Python's or of NumPy's; `ValueError` names anything else."""
-    found = _static(name, value, expected)
-    if not isinstance(found, int | float) or not valid(found):
+    """A static number of Python or NumPy that is `valid`; `ValueError` otherwise."""
+    scalar = _static(name, value, expected)
+    if not isinstance(scalar, int | float) or not valid(scalar):
         raise ValueError(f"`{name}` must be {expected}, got {value!r:.60}.")
-    return float(found)
+    return float(scalar)
 
 
 def _static(name: str, value: Any, expected: str) -> Any:
-    """What a Python or NumPy scalar holds, as Python's own type; no number for a boolean."""
+    """A scalar as a Python object, None for a boolean; `ValueError` where it is traced."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(
             f"`{name}` must be {expected} and static, got a traced value: give a Python number."

@@ -1,19 +1,19 @@
-"""Libraries that come with an extra of the package."""
+"""Imports of libraries that only an extra of the package installs."""
 
 from types import TracebackType
 from typing import final
 
 
 class MissingExtraError(ImportError):
-    """A library is not installed, and the message names the extra that brings it."""
+    """A library is not installed; the message names the extra that installs it."""
 
 
 @final
 class needs:
-    """A context for imports of libraries that the plain installation lacks.
+    """A context manager for imports of libraries that the plain installation lacks.
 
-    `with needs("io"): import PIL` raises a `MissingExtraError` that names the extra where the
-    library is not installed. One that is installed and fails to load keeps its own error.
+    `with needs("io"): import PIL` raises `MissingExtraError`, with the name of the extra, where
+    the library is not installed. The error of one that is installed but fails to load is kept.
     """
 
     def __init__(self, extra: str):

@@ -1,4 +1,7 @@
-"""Files written whole or not at all, under names that say what they are."""
+"""Writing files: whole or not at all, and with the suffix of their format.
+
+`exr`, `io`, `tradeoff`, the examples and the benchmarks write files by `write_whole`.
+"""
 
 import os
 import secrets
@@ -9,14 +12,18 @@ StrPath = str | os.PathLike[str]
 
 
 def check_suffix(name: str, path: StrPath, suffix: str) -> None:
-    """Raise `ValueError` if `path` ends in the suffix of another format."""
-    found = Path(path).suffix
-    if found and found.lower() != suffix:
+    """Raise `ValueError` if `path` has a suffix, and it is not that of the format."""
+    actual = Path(path).suffix
+    if actual and actual.lower() != suffix:
         raise ValueError(f"`{name}` must end in `{suffix}`, the format, got `{path}`.")
 
 
 def write_whole(path: StrPath, data: bytes | bytearray | memoryview) -> None:
-    """Write a file whole or not at all: beside the old one, then into its place."""
+    """Write a file whole or not at all.
+
+    The data go to a temporary file in the same folder, which then replaces the old one. On an
+    error the old file stays as it was.
+    """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{secrets.token_hex(8)}.tmp")
     try:

@@ -214,7 +214,7 @@ class ThinLens(eqx.Module):
     def from_sensor(
         cls,
         focal_length: Any,
-        f_stop: Any,
+        f_number: Any,
         focus_distance: Any,
         sensor_width: Any,
         width: WholeNumber,
@@ -229,30 +229,30 @@ class ThinLens(eqx.Module):
 
         - `focal_length`, `focus_distance`, `sensor_width`: lengths, all in one unit. Blender's
           are in millimetres, but for the distance.
-        - `f_stop`: the ratio of the focal length to the aperture.
+        - `f_number`: the ratio of the focal length to the aperture.
         - `width`: static; pixels along the side that `sensor_width` fits: of Blender's "AUTO",
           the longer one.
 
         **Returns:** the lens: `focal_pixels` is `focal_length / sensor_width * width`, and
-        `aperture` is `focal_length / f_stop`.
+        `aperture` is `focal_length / f_number`.
 
         **Raises:** `ValueError` for a number that is not positive.
 
         **Gradient:** exact.
 
-        Source: Blender's Cycles, whose lens is `focal_length / (2 f_stop)` in radius and whose
-        rays through a pixel meet in the plane in focus.
+        Source: Blender's Cycles, whose lens is `focal_length / (2 f_number)` in radius and
+        whose rays through a pixel meet in the plane in focus.
         """
-        focal_length, f_stop, sensor_width = (
+        focal_length, f_number, sensor_width = (
             _finite(f"from_sensor({name})", value, _positive, "positive")
             for name, value in (
                 ("focal_length", focal_length),
-                ("f_stop", f_stop),
+                ("f_number", f_number),
                 ("sensor_width", sensor_width),
             )
         )
         width = whole_number("from_sensor(width)", width)
-        return cls(focal_length / f_stop, focus_distance, focal_length / sensor_width * width)
+        return cls(focal_length / f_number, focus_distance, focal_length / sensor_width * width)
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
         """The lens' factor of the defocus, never negative, and the depth's, with the sign."""

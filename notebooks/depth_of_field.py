@@ -135,7 +135,7 @@ def largest(x, side):
 jump = largest(inverse, 3) > -1.05 * largest(-inverse, 3)
 band = largest(jump.astype(jnp.float32), int(LARGEST) + 1) > 0
 
-second = scene.gbuffer(room, camera, height=SIDE, width=SIDE, layer=1)
+second = scene.gbuffer(room, camera, height=SIDE, width=SIDE, layer_index=1)
 behind = relight.render(second, camera, lights), second.depth
 both = {"layered, two layers": program(ft.partial(dof.layered, behind=behind))}
 jax.block_until_ready(both["layered, two layers"]())
@@ -201,7 +201,7 @@ lamps = scene.default_lights(view)
 
 
 def layer_of(eye, layer=0):
-    seen = scene.gbuffer(training, eye, height=SMALL, width=SMALL, layer=layer)
+    seen = scene.gbuffer(training, eye, height=SMALL, width=SMALL, layer_index=layer)
     return relight.render(seen, eye, lamps), seen.depth
 
 

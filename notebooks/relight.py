@@ -234,9 +234,9 @@ small_size = {"height": 120, "width": 160}
 def orbit(degrees, rise=0.0, away=1.0):
     angle = np.radians(degrees)
     turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    offset = away * (turn @ (np.array(look.eye) - look.target))
-    eye = np.array(look.target) + offset + [0, rise, 0]
-    return PinholeCamera.look_at(eye, look.target, up=[0, 1, 0], fov_y=look.fov, **small_size)
+    offset = away * (turn @ (np.array(look.eye) - look.at))
+    eye = np.array(look.at) + offset + [0, rise, 0]
+    return PinholeCamera.look_at(eye, look.at, up=[0, 1, 0], fov_y=look.fov, **small_size)
 
 
 stations = {
@@ -358,7 +358,7 @@ bounce_size = {"height": 60, "width": 80}
 bounce_camera = scene.default_camera(mesh, **bounce_size)
 bounce_cache = scene.gbuffer(mesh, bounce_camera, **bounce_size)
 started = time.perf_counter()
-transfer = scene.transfer(mesh, bounce_cache, bounce_camera, points=256, rank=64)
+transfer = scene.transfer(mesh, bounce_cache, bounce_camera, point_count=256, rank=64)
 print(f"{time.perf_counter() - started:.0f} s to build, once for all lights")
 lamp = PointLight([0.5, 1.4, -1.5], [2.0, 1.8, 1.5])
 shown = jnp.isfinite(bounce_cache.depth)

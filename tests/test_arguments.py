@@ -269,7 +269,7 @@ CALLS = {
     "PinholeCamera.look_at": (
         PinholeCamera.look_at,
         {
-            **{"eye": np.zeros(3), "target": np.ones(3), "up": np.array([0.0, 1, 0])},
+            **{"eye": np.zeros(3), "at": np.ones(3), "up": np.array([0.0, 1, 0])},
             **{"fov_y": 0.9, "height": 4, "width": 5},
         },
     ),
@@ -289,7 +289,7 @@ CALLS = {
     "PinholeCamera.rays": (ft.partial(PinholeCamera.rays, CAMERA), {"height": 4, "width": 5}),
     "OrthographicCamera": (
         OrthographicCamera,
-        {"pixels_per_unit": 1.0, "centre": np.zeros(2), "world_from_camera": np.eye(4)},
+        {"pixels_per_unit": 1.0, "center": np.zeros(2), "world_from_camera": np.eye(4)},
     ),
     "OrthographicCamera.project": (
         ft.partial(OrthographicCamera.project, FLAT),
@@ -506,7 +506,7 @@ def test_no_function_is_forgotten():
     """Every public function of arrays, and every type of ours, has its good call."""
     host = {"scene", "exr", "io", "tradeoff"}
     records = {"Plan", "Accumulation", "Choice", "Hit", "Receivers", "Candidates", "Lens"}
-    records |= {"Filled"}
+    records |= {"Filled", "Projection", "Rays"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -22,6 +22,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
 NUMERICS = {
+    "_arrays",
     *("_checks", "_extras", "_filter", "_holes", "_linear", "_numerics", "_platform"),
     *("_progress", "_pyramid", "_sampling", "_tiles"),
 }
@@ -144,7 +145,7 @@ PROCESS_WIDE = re.compile(
 )
 # How PyOpenGL is told which library to load, before it is imported; and matplotlib, which no
 # two threads may use at once, which fonts to put into a file. Neither takes an argument.
-MAY_CHANGE_PROCESS = {"scene/_opengl.py": {"os.environ"}, "tradeoff.py": {"matplotlib.rc"}}
+MAY_CHANGE_PROCESS = {"scene/opengl.py": {"os.environ"}, "tradeoff.py": {"matplotlib.rc"}}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

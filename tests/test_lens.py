@@ -60,12 +60,12 @@ def test_a_50_mm_lens_at_f_2():
 
 
 def test_from_sensor_is_the_cone_of_rays_through_a_fixed_sensor():
-    """A pixel's rays leave a disc of `F / f_stop` and meet in the plane in focus."""
-    focal_length, f_stop, focus, sensor, width = 0.05, 2.8, 2.6, 0.036, 1920
-    lens = ThinLens.from_sensor(focal_length, f_stop, focus, sensor, width)
+    """A pixel's rays leave a disc of `F / f_number` and meet in the plane in focus."""
+    focal_length, f_number, focus, sensor, width = 0.05, 2.8, 2.6, 0.036, 1920
+    lens = ThinLens.from_sensor(focal_length, f_number, focus, sensor, width)
     for depth in (0.7, 2.6, 9.0):
         # By similar triangles: the width of the cone there, in the scene, then in pixels.
-        across = focal_length / f_stop * abs(depth - focus) / focus
+        across = focal_length / f_number * abs(depth - focus) / focus
         pixels = across / depth * focal_length / sensor * width
         coc = lens.circle_of_confusion(depth)
         np.testing.assert_allclose(coc, pixels, rtol=1e-12, atol=1e-12)
@@ -345,7 +345,7 @@ def physical(**changes):
 
 
 def sensor(**changes):
-    arguments = {"focal_length": 50, "f_stop": 2, "focus_distance": 3000, "sensor_width": 36}
+    arguments = {"focal_length": 50, "f_number": 2, "focus_distance": 3000, "sensor_width": 36}
     return ThinLens.from_sensor(**({"width": 640} | arguments | changes))
 
 
@@ -396,7 +396,7 @@ def sensor(**changes):
             r"`ThinLens\(focal_pixels\)` must be positive, got inf",
         ),
         (lambda: physical(f_number=0), r"`from_physical\(f_number=...\)` must be positive"),
-        (lambda: sensor(f_stop=-1), r"`from_sensor\(f_stop\)` must be positive, got -1"),
+        (lambda: sensor(f_number=-1), r"`from_sensor\(f_number\)` must be positive, got -1"),
         (lambda: sensor(width=-2), r"`from_sensor\(width\)` must be a positive integer"),
     ],
 )

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxfx import PinholeCamera, PointLight, relight, scene
 from jaxfx._sampling import pixel_centers
-from jaxfx.scene._embree import _accelerated
+from jaxfx.scene.embree import accelerated
 
 
 @functools.cache
@@ -46,7 +46,7 @@ def new_view(size, count):
     )
     place = lambda offset: PinholeCamera.look_at(
         np.array(look.eye) + offset,
-        look.target,
+        look.at,
         up=[0, 1, 0],
         fov_y=look.fov,
         height=size[0],
@@ -63,15 +63,15 @@ def shadow_starts(mesh, gbuffer, camera):
     depth = gbuffer.depth
     height, width = depth.shape
     points = camera.unproject(pixel_centers(height, width, depth.dtype), depth)
-    start = (np.asarray(points) - mesh.centre) / mesh.scale + 1e-3 * np.asarray(gbuffer.normal)
+    start = (np.asarray(points) - mesh.center) / mesh.radius + 1e-3 * np.asarray(gbuffer.normal)
     return np.where(np.isfinite(start), start, 0).reshape(-1, 3).astype(np.float32)
 
 
 def unshadowed(mesh, start, light):
     """1 where nothing stands between a start and a point light, by one ray for each."""
-    end = (np.asarray(light.position) - mesh.centre) / mesh.scale
+    end = (np.asarray(light.position) - mesh.center) / mesh.radius
     reach = np.ones(len(start), np.float32)
-    hit = _accelerated(mesh).run(
+    hit = accelerated(mesh).run(
         start, end.astype(np.float32) - start, dists=reach, query="OCCLUDED"
     )
     return hit < 0

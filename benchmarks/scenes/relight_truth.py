@@ -36,7 +36,7 @@ def lambert(mesh, camera, size):
 
 def shadow_of(mesh, gbuffer, camera, light, map_size=1024):
     """The light's visibility by shadow maps, unfiltered."""
-    ball = {"centre": mesh.centre, "radius": mesh.scale}
+    ball = {"centre": mesh.center, "radius": mesh.radius}
     cameras = shadow.light_cameras(light, map_size=map_size, **ball)
     take = functools.partial(scene.depth, mesh, height=map_size, width=map_size)
     maps = [take(each, backend="embree") for each in cameras]
@@ -49,7 +49,7 @@ def unshadowed(mesh, position, light):
     """1 where nothing stands between a point and the light, else 0."""
     if isinstance(light, DirectionalLight):
         way = np.asarray(light.direction, float)
-        end = np.asarray(position) - 4 * mesh.scale * way / np.linalg.norm(way)
+        end = np.asarray(position) - 4 * mesh.radius * way / np.linalg.norm(way)
     else:
         end = np.asarray(light.position, float)
     return np.asarray(scene.visible(mesh, position, end), np.float32)

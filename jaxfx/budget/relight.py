@@ -152,7 +152,7 @@ def _parts(gbuffer: GBuffer, camera: Any, *lights: Any) -> list[Part]:
     shift = 0.5 - (_EVERY // 2 + 0.5) / _EVERY
     pose = camera.world_from_camera
     if isinstance(camera, OrthographicCamera):
-        scale, centre = camera.pixels_per_unit / _EVERY, camera.centre / _EVERY + shift
+        scale, centre = camera.pixels_per_unit / _EVERY, camera.center / _EVERY + shift
         camera = OrthographicCamera(scale, centre, pose)
     else:
         fewer = np.array([[1 / _EVERY, 0, shift], [0, 1 / _EVERY, shift], [0, 0, 1]])

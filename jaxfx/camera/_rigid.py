@@ -129,14 +129,14 @@ def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
     return jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
 
 
-def look_at_pose(eye: Any, target: Any, up: Any) -> Float[Array, "4 4"]:
-    """At `eye`, with `target` ahead and `up` towards the top of the picture."""
+def look_at_pose(eye: Any, at: Any, up: Any) -> Float[Array, "4 4"]:
+    """At `eye`, with `at` ahead and `up` towards the top of the picture."""
     eye = parameter("look_at(eye)", eye, (3,))
-    target = parameter("look_at(target)", target, (3,))
+    at = parameter("look_at(at)", at, (3,))
     up = parameter("look_at(up=...)", up, (3,))
-    forward = normalize(target - eye)
+    forward = normalize(at - eye)
     right = normalize(jnp.cross(forward, up))
-    check("look_at(target)", forward, lambda v: v.any(), "away from `eye`")
+    check("look_at(at)", forward, lambda v: v.any(), "away from `eye`")
     check("look_at(up=...)", right, lambda v: v.any(), "off the direction of view")
     down = jnp.cross(forward, right)
     columns = jnp.stack([right, down, forward, eye], axis=1)

@@ -11,6 +11,7 @@ from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_num
 from jaxfx._numerics import inverse, normalize, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import _conventions
+from jaxfx.camera._records import Projection, Rays
 from jaxfx.camera._rigid import (
     DepthMap,
     Depths,
@@ -28,11 +29,12 @@ from jaxfx.camera._rigid import (
 )
 
 
+# The identity: OpenCV's rotation if none is given.
 _UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def _size(function: str, height: Any, width: Any) -> tuple[int, int]:
-    """The size of a picture; `ValueError` names a side that is no positive integer."""
+    """An image's height and width; `ValueError` names one that is no positive integer."""
     return (
         whole_number(f"{function}(height=...)", height),
         whole_number(f"{function}(width=...)", width),
@@ -41,20 +43,31 @@ def _size(function: str, height: Any, width: Any) -> tuple[int, int]:
 
 @final
 class PinholeCamera(eqx.Module):
-    """A perspective camera with square or oblong pixels, skew allowed.
+    """A perspective camera, given by its intrinsics and its pose.
+
+    `from_fov` and `look_at` make one; others convert the cameras of other programs.
 
     **Arguments:**
 
-    - `intrinsics`: 3x3, from camera axes to pixels (focal lengths, positive, and principal
-      point in pixels, last row 0 0 1).
+    - `intrinsics`: 3x3, from camera axes to pixels: positive focal lengths, a skew, and the
+      principal point, in pixels; the last row is 0 0 1.
     - `world_from_camera`: 4x4 rigid pose: an orthonormal rotation and a position.
 
     **Raises:** `ValueError` for a wrong shape, for intrinsics that are not finite or of another
-    form, and for a pose with a scale, a shear or a mirror in it. Traced values can't be looked
-    at: what such a pose shows is not what `unproject` gives.
+    form, and for a pose with a scale, shear or reflection. Traced values are not checked: with
+    such a pose `project` is not the inverse of `unproject`.
 
-    **Gradient:** exact with respect to both fields. The pose is not projected back onto the
-    rigid motions: parametrize it, by a twist say, to stay on them.
+    **Gradient:** exact with respect to both fields. A step along it leaves the rigid motions:
+    parametrize the pose, by a twist say, to stay on them.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import PinholeCamera
+    >>> intrinsics = jnp.array([[10.0, 0, 4], [0, 10, 3], [0, 0, 1]])
+    >>> camera = PinholeCamera(intrinsics, jnp.eye(4))
+    >>> print(camera.project((0.0, 0.0, 2.0)).pixels)
+    [4. 3.]
     """
 
     SHAPES: ClassVar = {"intrinsics": (3, 3), "world_from_camera": (4, 4)}
@@ -84,13 +97,13 @@ class PinholeCamera(eqx.Module):
         width: WholeNumber,
         world_from_camera: Any | None = None,
     ) -> "PinholeCamera":
-        """Square pixels and a centred principal point.
+        """A camera with square pixels and the principal point in the middle of the image.
 
         **Arguments:**
 
         - `fov_y`: vertical field of view, in radians, between 0 and pi.
         - `height`, `width`: static; image size in pixels.
-        - `world_from_camera`: the 4x4 pose; the identity by default.
+        - `world_from_camera`: the 4x4 pose; None for the identity.
 
         **Returns:** the camera.
 
@@ -98,6 +111,12 @@ class PinholeCamera(eqx.Module):
         integer or a pose that is not rigid.
 
         **Gradient:** exact in `fov_y`.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera
+        >>> print(PinholeCamera.from_fov(0.8, height=6, width=8).intrinsics[:2, 2])
+        [4. 3.]
         """
         fov_y = parameter("from_fov(fov_y)", fov_y)
         check("from_fov(fov_y)", fov_y, lambda v: (v > 0) & (v < jnp.pi), "in (0, pi) radians")
@@ -111,28 +130,37 @@ class PinholeCamera(eqx.Module):
     def look_at(
         cls,
         eye: Any,
-        target: Any,
+        at: Any,
         *,
         up: Any,
         fov_y: Any,
         height: WholeNumber,
         width: WholeNumber,
     ) -> "PinholeCamera":
-        """The camera at `eye` that has `target` at the middle of its picture.
+        """A camera at the position `eye` that looks at the point `at`.
 
         **Arguments:**
 
-        - `eye`, `target`: world positions, 3.
-        - `up`: a world direction, 3, that points to the top of the picture.
+        - `eye`, `at`: world positions, 3. `at` is shown in the middle of the image.
+        - `up`: a world direction, 3, that points to the top of the image.
         - `fov_y`, `height`, `width`: as in `from_fov`.
 
         **Returns:** the camera.
 
-        **Raises:** `ValueError` where `eye` is `target` or `up` lies along the view.
+        **Raises:** `ValueError` where `eye` is `at` or `up` lies along the view.
 
         **Gradient:** exact; zero where the pose is degenerate.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.look_at(
+        ...     (0.0, 0, 4), (0.0, 0, 0), up=(0.0, 1, 0), fov_y=0.8, height=6, width=8
+        ... )
+        >>> print(camera.project((0.0, 0.0, 0.0)).depth)
+        4.0
         """
-        pose = look_at_pose(eye, target, up)
+        pose = look_at_pose(eye, at, up)
         height, width = _size("look_at", height, width)
         return cls.from_fov(fov_y, height=height, width=width, world_from_camera=pose)
 
@@ -140,30 +168,39 @@ class PinholeCamera(eqx.Module):
     def from_opencv(
         cls, intrinsics: Any, *, rotation: Any = _UPRIGHT, translation: Any = (0.0, 0.0, 0.0)
     ) -> "PinholeCamera":
-        """The camera of OpenCV's camera matrix, whose pixel centres are whole numbers.
+        """A camera from OpenCV's camera matrix and pose.
 
         **Arguments:**
 
         - `intrinsics`: 3x3, the camera matrix of `calibrateCamera`, in pixels. Undistort
-          pictures first.
+          images first.
         - `rotation`, `translation`: 3x3 and 3, camera from world, in scene units: `rotation @ X
-          + translation` is X in camera axes. `cv2.Rodrigues` makes the one of `rvec`.
+          + translation` is X in camera axes. `cv2.Rodrigues` converts `rvec`.
 
-        **Returns:** the camera; its principal point is half a pixel farther along both axes.
+        **Returns:** the camera. Its principal point is half a pixel larger along both axes,
+        since OpenCV's pixel centres are whole numbers.
 
         **Raises:** `ValueError` as `PinholeCamera`.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import PinholeCamera
+        >>> matrix = jnp.array([[10.0, 0, 3.5], [0, 10, 2.5], [0, 0, 1]])
+        >>> print(PinholeCamera.from_opencv(matrix).intrinsics[:2, 2])
+        [4. 3.]
         """
         return cls(*_conventions.opencv(intrinsics, rotation, translation))
 
     @classmethod
     def from_colmap(cls, model: str, params: Any, *, qvec: Any, tvec: Any) -> "PinholeCamera":
-        """The camera of a line of COLMAP's `cameras.txt` and one of its `images.txt`.
+        """A camera from a line of COLMAP's `cameras.txt` and one of its `images.txt`.
 
         **Arguments:**
 
-        - `model`: "SIMPLE_PINHOLE" or "PINHOLE". Pictures with distortion are to be undistorted
+        - `model`: "SIMPLE_PINHOLE" or "PINHOLE". Images with distortion must be undistorted
           first, by COLMAP's `image_undistorter`.
         - `params`: f, cx, cy or fx, fy, cx, cy, in pixels.
         - `qvec`, `tvec`: 4 and 3, camera from world: a quaternion (w, x, y, z) of any length,
@@ -174,6 +211,15 @@ class PinholeCamera(eqx.Module):
         **Raises:** `ValueError` for another model or a wrong number of parameters.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_colmap(
+        ...     "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), qvec=(1.0, 0, 0, 0), tvec=(0.0, 0, 2)
+        ... )
+        >>> print(camera.world_from_camera[:3, 3])
+        [ 0.  0. -2.]
         """
         return cls(*_conventions.colmap(model, params, qvec, tvec))
 
@@ -191,17 +237,18 @@ class PinholeCamera(eqx.Module):
         shift_x: Any = 0.0,
         shift_y: Any = 0.0,
     ) -> "PinholeCamera":
-        """The camera of a Blender object, by the names that its properties have there.
+        """A camera from a Blender camera object; arguments have the names of its properties.
 
         **Arguments:**
 
         - `matrix_world`: 4x4, world from camera, which looks along -z with y up; a scale in it
-          is ignored, as Blender does.
+          is ignored, as in Blender.
         - `lens`: focal length, in the unit of the sensor: millimetres.
-        - `height`, `width`: static; the render's size in square pixels, its percentage applied.
-        - `sensor_width`, `sensor_height`, `sensor_fit`: lengths, and which of them the focal
-          length is a ratio to: the width, along the longer side, or with "HORIZONTAL" along
-          rows; or with "VERTICAL" the height, along columns.
+        - `height`, `width`: static; the render's size in square pixels, after its percentage.
+        - `sensor_width`, `sensor_height`: the sensor's size, in millimetres.
+        - `sensor_fit`: which length the field of view fits: "AUTO" the sensor's width, along
+          the image's longer side; "HORIZONTAL" the width, along rows; "VERTICAL" the height,
+          along columns.
         - `shift_x`, `shift_y`: ratios to the side in pixels that the sensor fits.
 
         **Returns:** the camera.
@@ -209,6 +256,14 @@ class PinholeCamera(eqx.Module):
         **Raises:** `ValueError` for a length that is not positive or an unknown fit.
 
         **Gradient:** exact in every float.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_blender(jnp.eye(4), lens=36.0, height=6, width=8)
+        >>> print(camera.intrinsics[0, 0])
+        8.0
         """
         size = _size("from_blender", height, width)
         sensor = sensor_width, sensor_height, sensor_fit
@@ -228,18 +283,15 @@ class PinholeCamera(eqx.Module):
         cx: Any | None = None,
         cy: Any | None = None,
     ) -> "PinholeCamera":
-        """The camera of a frame of a `transforms.json`, as NeRF and its kin have them.
-
-        The pictures are Blender's, whose middle is between the middle pixels. (The first NeRF's
-        own program looked half a pixel beside it.)
+        """A camera from a frame of a `transforms.json`, the format of NeRF and its successors.
 
         **Arguments:**
 
         - `transform_matrix`: 4x4, world from camera, which looks along -z with y up.
-        - `height`, `width`: static; the picture's size in pixels.
-        - `camera_angle_x`: the horizontal field of view, in radians; or else `fl_x`.
-        - `fl_x`, `fl_y`: focal lengths in pixels, the second the first if it is left out.
-        - `cx`, `cy`: the principal point in pixels, the middle if they are left out.
+        - `height`, `width`: static; the image's size in pixels.
+        - `camera_angle_x`: the horizontal field of view, in radians; give it or `fl_x`.
+        - `fl_x`, `fl_y`: focal lengths in pixels; None for `fl_y` is `fl_x`.
+        - `cx`, `cy`: the principal point in pixels; None is the middle of the image.
 
         **Returns:** the camera.
 
@@ -247,6 +299,17 @@ class PinholeCamera(eqx.Module):
         of range.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_nerf(jnp.eye(4), height=6, width=8, fl_x=10.0)
+        >>> print(camera.intrinsics[:2, 2])
+        [4. 3.]
+
+        The images are Blender's, whose middle lies between the middle pixels. (The code of the
+        first NeRF is off by half a pixel.)
         """
         size, focal = _size("from_nerf", height, width), (camera_angle_x, fl_x, fl_y)
         return cls(*_conventions.nerf(transform_matrix, focal, (cx, cy), size))
@@ -255,36 +318,51 @@ class PinholeCamera(eqx.Module):
     def from_opengl(
         cls, view: Any, projection: Any, *, height: WholeNumber, width: WholeNumber
     ) -> "PinholeCamera":
-        """The camera of OpenGL's two matrices; its clip planes are not kept.
+        """A camera from OpenGL's view and projection matrices; clip planes are dropped.
 
         **Arguments:**
 
-        - `view`: 4x4, camera from world, looking along -z with y up; without the model's part.
-        - `projection`: 4x4, of a perspective. Both multiply columns: OpenGL's memory, which
-          holds one column after another, is to be transposed.
+        - `view`: 4x4, camera from world, looking along -z with y up, without a model matrix.
+        - `projection`: 4x4, a perspective. Both matrices multiply column vectors: transpose
+          OpenGL's memory, which is column by column.
         - `height`, `width`: static; the viewport's size in pixels.
 
-        **Returns:** the camera. Its row 0 is the picture's top, OpenGL's last.
+        **Returns:** the camera. Its row 0 is the top of the image, which is OpenGL's last row.
 
         **Raises:** `ValueError` for a projection that is no perspective.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import PinholeCamera
+        >>> rows = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, -2], [0, 0, -1, 0]]
+        >>> projection = jnp.array(rows)
+        >>> camera = PinholeCamera.from_opengl(jnp.eye(4), projection, height=6, width=8)
+        >>> print(camera.intrinsics[:2, 2])
+        [4. 3.]
         """
         return cls(*_conventions.opengl(view, projection, _size("from_opengl", height, width)))
 
-    def rays(
-        self, *, height: WholeNumber, width: WholeNumber
-    ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+    def rays(self, *, height: WholeNumber, width: WholeNumber) -> Rays:
         """The ray through each pixel's centre.
 
-        **Arguments:** `height`, `width`: static; the picture's size in pixels.
+        **Arguments:** `height`, `width`: static; the image's size in pixels.
 
-        **Returns:** origins, all at the eye, in scene units, and unit directions; height width
-        3 each, in the world's axes, in the type of `intrinsics`.
+        **Returns:** `Rays(origins, directions)`: origins, all at the eye, in scene units, and
+        unit directions; height width 3 each, in world axes, in the type of `intrinsics`.
 
         **Raises:** `ValueError` for a size that is no positive integer, or a batch of cameras.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera
+        >>> rays = PinholeCamera.from_fov(0.8, height=6, width=8).rays(height=6, width=8)
+        >>> rays.directions.shape
+        (6, 8, 3)
         """
         check_fields("PinholeCamera.rays", self)
         dtype = self.intrinsics.dtype
@@ -292,78 +370,114 @@ class PinholeCamera(eqx.Module):
         local = transformed(inverse(self.intrinsics), homogeneous(pixels))
         directions = normalize(transformed(self.world_from_camera[:3, :3], local)).astype(dtype)
         eye = self.world_from_camera[:3, 3].astype(dtype)
-        return jnp.broadcast_to(eye, directions.shape), directions
+        return Rays(jnp.broadcast_to(eye, directions.shape), directions)
 
     def points(self, depth: DepthMap) -> Float[Array, "height width 3"]:
-        """What every pixel of a depth image shows: the world point at its centre.
+        """The world point that each pixel of a depth image shows, at the pixel's centre.
 
         **Arguments:** `depth`: height width, scene units along the optical axis.
 
-        **Returns:** world positions, height width 3, in the type of `depth`, of integers in
+        **Returns:** world positions, height width 3, in the type of `depth`, for integers in
         JAX's default float type. Where the depth is inf they are not finite.
 
         **Raises:** `ValueError` for a wrong shape, or a batch of cameras.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_fov(0.8, height=6, width=8)
+        >>> camera.points(jnp.full((6, 8), 2.0)).shape
+        (6, 8, 3)
         """
         pixels, depth, dtype = read_map(depth)
         return self.unproject(pixels, depth).astype(dtype)
 
-    def project(self, points: Points) -> tuple[Float[Array, "... 2"], Float[Array, "..."]]:
-        """Pixels and depth of world points.
+    def project(self, points: Points) -> Projection:
+        """The pixels and depths of world points.
 
         **Arguments:** `points`: world positions, `... 3`, in scene units, floats or integers.
 
-        **Returns:** `pixels`, `... 2`, as (x, y) with centres at +0.5; and `depth`, `...`,
-        along the optical axis, both in the type of `points`, of integers in JAX's default float
-        type. A point behind the camera has a negative depth, and its pixels are those of the
-        line through the eye.
+        **Returns:** `Projection(pixels, depth)`: `pixels`, `... 2`, are (x, y) with centres at
+        +0.5; `depth`, `...`, is along the optical axis; both in the type of `points`, for
+        integers in JAX's default float type. A point behind the camera has a negative depth;
+        its pixel is that of the line through the point and the eye.
 
         **Raises:** `ValueError` for a wrong shape, what is no array of numbers, or a batch of
         cameras.
 
         **Gradient:** exact; infinite where the depth is 0.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_fov(0.8, height=6, width=8)
+        >>> pixels, depth = camera.project((0.0, 0.0, 2.0))
+        >>> print(pixels, depth)
+        [4. 3.] 2.0
         """
         points = read_points(self, "project", points, 3)
         dtype = points.dtype
         local = to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         depth = local[..., 2]
         scaled = transformed(self.intrinsics, local)
-        return (scaled[..., :2] / depth[..., None]).astype(dtype), depth.astype(dtype)
+        pixels = scaled[..., :2] / depth[..., None]
+        return Projection(pixels.astype(dtype), depth.astype(dtype))
 
     def unproject(self, pixels: Pixels, depth: Depths) -> Float[Array, "... 3"]:
-        """World points of pixels at a depth: the inverse of `project`.
+        """World points of pixels at given depths: the inverse of `project`.
 
         **Arguments:** `pixels`: `... 2`, (x, y); `depth`: `...`, scene units along the axis;
-        floats or integers, one depth for several pixels or the other way round.
+        floats or integers, which broadcast.
 
-        **Returns:** world positions, `... 3`, in the wider type of the two, of integers in
+        **Returns:** world positions, `... 3`, in the wider type of the two, for integers in
         JAX's default float type. Infinite depth gives non-finite points.
 
         **Raises:** `ValueError` as `project`, and for a depth that does not fit the pixels.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_fov(0.8, height=6, width=8)
+        >>> camera.unproject(jnp.ones((5, 2)), 2.0).shape
+        (5, 3)
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
         rays = transformed(inverse(self.intrinsics), homogeneous(pixels))
         return to_world(self.world_from_camera, rays * depth[..., None]).astype(dtype)
 
     def through_lens(self, offset: Any, *, focus_distance: Any) -> "PinholeCamera":
-        """The off-axis camera at a point of the lens whose focus plane stays where it is.
+        """The camera at another point of the lens, with the same plane in focus.
 
-        A point at depth `focus_distance` keeps its pixel; one at depth Z moves by
-        `offset * focal * (1 / focus_distance - 1 / Z)` pixels.
+        The mean of images through many points of a lens is the image through the lens:
+        `dof.accumulate` does that.
 
         **Arguments:**
 
         - `offset`: 2, from the lens' centre along the camera's x and y, in scene units.
-        - `focus_distance`: depth of the plane that stays fixed, in scene units.
+        - `focus_distance`: depth of the plane in focus, in scene units.
 
-        **Returns:** the camera: the eye moved, the principal point sheared.
+        **Returns:** the camera: the eye is moved, and the principal point shifted so that
+        points at depth `focus_distance` keep their pixels.
 
         **Raises:** `ValueError` for a focus distance that is not positive.
 
         **Gradient:** exact.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera
+        >>> camera = PinholeCamera.from_fov(0.8, height=6, width=8)
+        >>> aside = camera.through_lens((0.1, 0.0), focus_distance=2.0)
+        >>> print(aside.project((0.0, 0.0, 2.0)).pixels.round(4))
+        [4. 3.]
+
+        A point at depth Z moves by `offset * focal * (1 / focus_distance - 1 / Z)` pixels.
 
         Source: Haeberli & Akeley 1990, the accumulation buffer's depth of field.
         """

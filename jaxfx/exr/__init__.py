@@ -1,55 +1,50 @@
 """Images, their depth and deep frame buffers in OpenEXR files.
 
-The file boundary, on the host: NumPy in and out. An EXR file holds linear numbers and keeps
-them to the bit; `jaxfx.io` has the formats for screens.
+| I want | call |
+|---|---|
+| to write an image, or several arrays by name | `write` |
+| to read every layer of a file | `read` |
+| an image and its depth, from Blender's or another renderer's file | `read_rgbd` |
+| to keep a G-buffer with its camera, and get both back | `write_gbuffer`, `read_gbuffer` |
+| one image or one depth from a file of any format | `io.read_color`, `io.read_depth` |
 
-Blender and Nuke know a channel by the last letter of its name, so the shape of an array and
-its key choose the letters:
+This runs on the host: NumPy arrays in and out. An EXR file stores linear numbers, to the bit.
+
+Blender and Nuke recognise a channel by the last letter of its name. `write` chooses the letters
+by an array's shape and key:
 
 | array               | key                    | channels in the file      |
 |---------------------|------------------------|---------------------------|
-| height width 3 or 4 | `""`, the main picture | `R` `G` `B` (`A`)         |
+| height width 3 or 4 | `""`, the main image   | `R` `G` `B` (`A`)         |
 | height width 3 or 4 | `name`                 | `name.R` `.G` `.B` (`.A`) |
-| height width 3 or 4 | a vector's, see below  | `name.X` `.Y` `.Z` (`.W`) |
+| height width 3 or 4 | a vector, see below    | `name.X` `.Y` `.Z` (`.W`) |
 | height width 2      | `name`                 | `name.X` `.Y`             |
 | height width 1      | `""` or `name`         | `Y`, `name.Y`             |
 | height width        | `depth`                | `depth.Z`                 |
 | height width        | `name`                 | `name.V`                  |
 
-Vectors are `normal`, `position`, `direction`, `tangent`, `velocity`, `motion` and `vector`, in
-any case and after any dot: `left.Normal`.
+A vector's key is `normal`, `position`, `direction`, `tangent`, `velocity`, `motion` or
+`vector`, in any letter case, alone or after a dot: `left.Normal`.
 
 | numbers                 | stored as                                                     |
 |-------------------------|---------------------------------------------------------------|
-| float16, float32        | HALF, FLOAT: every bit, infinities and NaNs too               |
+| float16, float32        | HALF, FLOAT, to the bit, infinities and NaNs included         |
 | float64                 | FLOAT, rounded: EXR has no double                             |
-| bool, unsigned integers | UINT; they come back as uint32                                |
-| signed integers         | FLOAT, exact or refused: EXR has none; they come back float32 |
+| bool, unsigned integers | UINT; read as uint32                                          |
+| signed integers         | FLOAT, exact or refused: EXR has none; read as float32        |
 """
 
-from typing import Any
-
-from jaxfx.exr.frame import read_gbuffer, write_gbuffer
+from jaxfx.exr.frame import Cache, read_gbuffer, write_gbuffer
 from jaxfx.exr.layers import read, write
-from jaxfx.exr.rgbd import read_rgbd
+from jaxfx.exr.rgbd import RGBD, read_rgbd
 
 
 __all__ = [
+    "RGBD",
+    "Cache",
     "read",
     "read_gbuffer",
     "read_rgbd",
     "write",
     "write_gbuffer",
 ]
-
-# Functions of `jaxfx.io` that stood here first, and are still found under these names.
-_MOVED = frozenset({"linear_from_srgb", "read_png", "srgb_from_linear", "write_png"})
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MOVED:
-        # Loaded when it is asked for: `jaxfx.io` reads EXR files by this package.
-        from jaxfx import io
-
-        return getattr(io, name)
-    raise AttributeError(f"module `jaxfx.exr` has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""The parts of an EXR file, as OpenEXR reads them: all of them, or none."""
+"""The parts of an EXR file, read by OpenEXR: all of them, or an error."""
 
 import builtins
 import io
@@ -14,41 +14,44 @@ from jaxfx._files import StrPath
 from jaxfx.exr import _seal
 
 
+# Default limit of width times height: a damaged header can't ask for more than about 1 GiB per
+# channel. A larger image needs `max_pixels`.
 MAX_PIXELS = 2**28
 
-# Rows in one chunk of a ZIP-compressed file.
+# Rows in one chunk of a ZIP-compressed file, by the format.
 CHUNK = 16
 
+# An EXR file's first bytes. In the byte after the next, this bit says that parts are deep.
 _MAGIC = b"v/1\x01"
-# In the second byte of the version, which follows: the file has deep parts.
 _DEEP = 0x08
 
 
-def _import_but_sys(name: str, *context: Any) -> Any:
+def _import_all_but_sys(name: str, *context: Any) -> Any:
+    """`__import__` that fails for `sys`; see `_without_print`."""
     if name == "sys":
-        raise ImportError("`sys` is not to be had here")
+        raise ImportError("`sys` is not available here")
     return builtins.__import__(name, *context)
 
 
-# Where OpenEXR cannot read the pixels of a part it leaves the part out, and says so on stdout
-# only, by pybind11's `print`. That looks for `sys.stdout` through the `__import__` of the
-# caller's globals, and stays silent where it gets none. So nothing is printed, and no state of
-# the process changes: to redirect stdout would take from other threads what they print.
-_quietly = FunctionType(
+# `_without_print(function, *args)` calls a function of OpenEXR that can't print. Where OpenEXR
+# can't read a part's pixels, it leaves the part out and says so on stdout only, by pybind11's
+# `print`. That imports `sys` by the `__import__` of the caller's globals, and is silent where
+# this fails. Redirecting stdout instead would also hide what other threads print.
+_without_print = FunctionType(
     (lambda function, *args, **options: function(*args, **options)).__code__,
-    {"__builtins__": {"__import__": _import_but_sys}},
+    {"__builtins__": {"__import__": _import_all_but_sys}},
 )
 
 
 class Part(NamedTuple):
-    """One image of a file: its attributes, and its pixels by the channels' own names."""
+    """One part of a file: its attributes, and its channels' pixels by name."""
 
     header: Mapping[str, Any]
     planes: dict[str, np.ndarray]
 
 
 def read_parts(path: StrPath, max_pixels: int, verify: bool) -> list[Part]:
-    """Every part with every channel; `ValueError` names the file otherwise."""
+    """Every part with every channel; `ValueError` names the file where one can't be read."""
     data = Path(path).read_bytes()
     if data[:4] != _MAGIC:
         found = f"got one that begins with {data[:4]!r}" if data else "got an empty one"
@@ -62,32 +65,33 @@ def read_parts(path: StrPath, max_pixels: int, verify: bool) -> list[Part]:
     if not headers:
         raise ValueError(f"`{path}` is damaged: it has no part.")
     sizes = [_size(path, header, max_pixels) for header in headers]
-    found = {part.part_index: part for part in _open(path, data, header_only=False)}
-    if lost := [i for i in range(len(headers)) if i not in found]:
+    by_index = {part.part_index: part for part in _open(path, data, header_only=False)}
+    if lost := [i for i in range(len(headers)) if i not in by_index]:
         raise ValueError(f"`{path}` is damaged: the pixels of part {lost[0]} cannot be read.")
     parts = []
     for i, (header, size) in enumerate(zip(headers, sizes, strict=True)):
-        planes = {name: channel.pixels for name, channel in found[i].channels.items()}
-        whole = planes.keys() == {channel.name for channel in header["channels"]}
-        if not whole or any(plane.shape != size for plane in planes.values()):
+        planes = {name: channel.pixels for name, channel in by_index[i].channels.items()}
+        is_complete = planes.keys() == {channel.name for channel in header["channels"]}
+        if not is_complete or any(plane.shape != size for plane in planes.values()):
             raise ValueError(f"`{path}` is damaged: part {i} lacks channels.")
         parts.append(Part(header, planes))
     return parts
 
 
 def _open(path: StrPath, data: bytes, *, header_only: bool) -> list[Any]:
+    """OpenEXR's parts of a file, those with damaged pixels left out."""
     with needs("io"):
         import OpenEXR
 
     options = {"separate_channels": True, "header_only": header_only}
     try:
-        return _quietly(OpenEXR.File, io.BytesIO(data), **options).parts
+        return _without_print(OpenEXR.File, io.BytesIO(data), **options).parts
     except Exception as error:
         raise ValueError(f"`{path}` is damaged, or not what OpenEXR reads: {error}") from error
 
 
 def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[int, int]:
-    """Height and width of a part that can be read; `ValueError` otherwise."""
+    """A part's height and width; `ValueError` where it is too large or of a kind not read."""
     with needs("io"):
         import OpenEXR
 
@@ -112,11 +116,11 @@ def _size(path: StrPath, header: Mapping[str, Any], max_pixels: int) -> tuple[in
 
 
 def full_names(path: StrPath, parts: list[Part]) -> dict[str, tuple[Part, str]]:
-    """The channels of all parts, each under a name of its own: its part, and its name there.
+    """All channels under names that are unique in the file: each one's part, and name there.
 
-    A name with a dot stays as it is where one part alone has it. Where the parts that share
-    it are of different views, the view stands before its last word, as in a file of one part:
-    `depth.right.Z`. Every other name of a later part follows the part's.
+    A name with a dot is kept if only one part has it. If the parts that share it have different
+    views, the view is put before the last word, as in a file of one part: `depth.right.Z`. To
+    any other name of a second or later part, the part's name is prefixed.
     """
     views: dict[str, list[str | None]] = {}
     for part in parts:
@@ -143,9 +147,10 @@ def full_names(path: StrPath, parts: list[Part]) -> dict[str, tuple[Part, str]]:
 
 
 def _differ(names: list[Any]) -> bool:
+    """Whether no two of the names are equal."""
     return len(set(names)) == len(names)
 
 
 def planes_of(channels: Mapping[str, tuple[Part, str]]) -> dict[str, np.ndarray]:
-    """The pixels of each of `full_names`."""
+    """The pixels of each of the channels that `full_names` lists."""
     return {full: part.planes[name] for full, (part, name) in channels.items()}

@@ -1,25 +1,26 @@
-"""EXR files as arrays by name. How keys become channels is in the package's docstring."""
+"""EXR files as arrays by name. The package's docstring says how keys become channels."""
 
 import io
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.exr import _seal
 from jaxfx.exr._parts import CHUNK, MAX_PIXELS, full_names, planes_of, read_parts
 
 
+# Last words of keys whose arrays are vectors, with channels X, Y, Z instead of R, G, B.
 _VECTORS = {"normal", "position", "direction", "tangent", "velocity", "motion", "vector"}
-# Nuke writes words for letters.
+# Nuke writes these words instead of letters.
 _LETTERS = {"RED": "R", "GREEN": "G", "BLUE": "B", "ALPHA": "A"}
 
 
 def _storable(name: str, array: np.ndarray) -> np.ndarray:
-    """`array` in one of EXR's three types."""
+    """`array` in a type that EXR has: float16, float32 or uint32; `ValueError` names it."""
     kind = array.dtype.kind
     if array.dtype in (np.float16, np.float32):
         return array
@@ -40,7 +41,7 @@ def _storable(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _letters(key: str, shape: tuple[int, ...]) -> str:
-    """The last letters of a layer's channels; none where EXR has none for it."""
+    """The letters of a layer's channels; "" where the shape is not one that is written."""
     word = key.rpartition(".")[2].lower()
     if len(shape) == 2:
         return "" if key == "" else "Z" if word == "depth" else "V"
@@ -51,7 +52,7 @@ def _letters(key: str, shape: tuple[int, ...]) -> str:
 
 
 def _planes(channels: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The channels of the file: an array for each letter."""
+    """The file's channels by name, height width each; `ValueError` for what can't be stored."""
     planes: dict[str, np.ndarray] = {}
     size = None
     for key, value in channels.items():
@@ -76,7 +77,7 @@ def _planes(channels: Mapping[str, Any]) -> dict[str, np.ndarray]:
         array = _storable(name, array)
         columns = [array] if array.ndim == 2 else [*np.moveaxis(array, 2, 0)]
         for letter, column in zip(letters, columns, strict=True):
-            # OpenEXR writes wrong pixels, without a word, where strides are not the plain ones.
+            # OpenEXR writes wrong pixels of arrays that are not contiguous, without an error.
             planes[f"{key}.{letter}" if key else letter] = np.ascontiguousarray(column)
     if not planes:
         raise ValueError("`write(channels)` must have a channel, got none.")
@@ -86,7 +87,7 @@ def _planes(channels: Mapping[str, Any]) -> dict[str, np.ndarray]:
 def write_planes(
     path: StrPath, channels: Mapping[str, Any], attributes: Mapping[str, Any]
 ) -> None:
-    """Write `channels`, and `attributes` into the header."""
+    """Write arrays by name, with extra attributes in the header."""
     with needs("io"):
         import OpenEXR
 
@@ -98,7 +99,7 @@ def write_planes(
         _seal.VERSION: 1,
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        # So that a reader notices a damaged height even unverified; OpenEXR would not.
+        # With it, `read` notices a damaged height without the checksum, too.
         "chunkCount": -(-height // CHUNK),
     }
     stream = io.BytesIO()
@@ -109,19 +110,29 @@ def write_planes(
 
 
 def write(path: StrPath, channels: Mapping[str, Any] | ArrayLike) -> None:
-    """Write an EXR file, ZIP-compressed, whole or not at all.
+    """Write an image, or several arrays by name, as an EXR file.
+
+    It is compressed without loss (ZIP), and written whole or not at all.
 
     **Arguments:**
 
     - `path`: the file; an old one is replaced once the new one is complete.
-    - `channels`: arrays by name, each height width or height width channel (1 to 4), all of
-      one height and width; the key `""` is the main picture. An image alone is taken for it.
-      The module's tables say how names and numbers are stored.
+    - `channels`: an image, or arrays by name, each height width or height width channel (1 to
+      4), all of one height and width. The key `""` is the main image. The package's tables say
+      how names and numbers are stored.
 
-    **Raises:** `ValueError` for an array that EXR can't hold, or a name that ends in another
-    suffix than `.exr`; `OSError` where the folder does not exist or can't be written.
+    **Raises:** `ValueError` for an array that EXR can't hold, or a path with another suffix
+    than `.exr`; `OSError` where the folder does not exist or can't be written.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import exr
+    >>> exr.write("frame.exr", {"": np.zeros((6, 8, 3)), "depth": np.ones((6, 8))})
+    >>> {name: array.shape for name, array in exr.read("frame.exr").items()}
+    {'': (6, 8, 3), 'depth': (6, 8)}
     """
     check_suffix("write(path)", path, ".exr")
     write_planes(path, channels if isinstance(channels, Mapping) else {"": channels}, {})
@@ -130,13 +141,13 @@ def write(path: StrPath, channels: Mapping[str, Any] | ArrayLike) -> None:
 def read_planes(
     path: StrPath, max_pixels: int, verify: bool
 ) -> tuple[dict[str, np.ndarray], Mapping[str, Any]]:
-    """Every channel of a file by its full name, and the header of its first part."""
+    """All channels of a file by their full names, and the header of its first part."""
     parts = read_parts(path, max_pixels, verify)
     return planes_of(full_names(path, parts)), parts[0].header
 
 
 def assemble(path: StrPath, planes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Channels put together to layers: what `_planes` took apart, and what others write."""
+    """Channels combined to layers, whether `_planes` or another program named them."""
     groups: dict[str, dict[str, str]] = {}
     for name in planes:
         layer, _, suffix = name.rpartition(".")
@@ -146,52 +157,65 @@ def assemble(path: StrPath, planes: Mapping[str, np.ndarray]) -> dict[str, np.nd
 
     layers: dict[str, np.ndarray] = {}
     for layer, group in groups.items():
-        within = ("RGBA", "RGB", "XYZW", "XYZ") if layer else ("RGBA", "RGB")
+        # Families that a group may have besides other channels; and those only by themselves.
+        colors_vectors = ("RGBA", "RGB", "XYZW", "XYZ") if layer else ("RGBA", "RGB")
         alone = ("XY", "Y", "Z", "V") if layer else ("Y",)
-        families = [family for family in within if group.keys() >= set(family)]
+        families = [family for family in colors_vectors if group.keys() >= set(family)]
         families += [family for family in alone if group.keys() == set(family)]
-        found = {}
+        arrays = {}
         # Parts of different sizes may share a layer's name.
         is_one_size = len({planes[name].shape for name in group.values()}) == 1
         if families and is_one_size:
             members = [planes[group.pop(letter)] for letter in families[0]]
-            scalar = families[0] in ("Z", "V")
-            found[layer] = members[0] if scalar else np.stack(members, axis=-1)
-        found |= {name: planes[name] for name in group.values()}
-        if twice := found.keys() & layers.keys():
+            is_scalar = families[0] in ("Z", "V")
+            arrays[layer] = members[0] if is_scalar else np.stack(members, axis=-1)
+        arrays |= {name: planes[name] for name in group.values()}
+        if twice := arrays.keys() & layers.keys():
             raise ValueError(f"`{path}` must name its layers differently, got {twice} twice.")
-        layers |= found
+        layers |= arrays
     return layers
 
 
 def read(
     path: StrPath, *, max_pixels: int = MAX_PIXELS, verify: bool = True
 ) -> dict[str, np.ndarray]:
-    """Read an EXR file: what `write` wrote, to the bit, under the same keys.
+    """Read every layer of an EXR file as an array by name.
 
-    Files of other programs are read too, of one part or several, in scan lines or tiles; an
-    array is the data window, at full resolution. A channel of no colour or vector, a bare `Z`
-    say, is a layer under its full name. The channels of a later part have the part's name in
-    front where they have no dot. Where several parts have one name with a dot, it holds the
-    part's view, if they differ in that, else the part's name in front: the depths of two views
-    in two parts are `depth.left` and `depth.right`.
+    A file of `write` comes back to the bit, under the same keys. Files of other programs are
+    read too.
 
     **Arguments:**
 
     - `path`: the file.
     - `max_pixels`: the largest width times height to accept, 2**28 by default, so that a
       damaged header can't ask for all memory.
-    - `verify`: whether a file of `write`'s must fit its checksum. One that another program has
-      rewritten, header and all, does not fit it any more; False reads it all the same.
+    - `verify`: True checks the checksum of a file that `write` wrote. A program that rewrote
+      such a file and kept its header made the checksum wrong: False reads it.
 
     **Returns:** arrays by name, height width or height width channel.
 
     **Raises:** `ValueError` that names the file where it is damaged, not EXR, deep, subsampled,
-    too large or has one name twice: all channels come back, or none. `OSError` where it can't
-    be opened. EXR has no checksum, so `write` puts one into the header: any bit that flips in
-    its files is noticed. In a file of another program, damage that makes another valid file is
-    not.
+    too large or has one name twice; then no channel is returned. `OSError` where it can't be
+    opened.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import exr
+    >>> exr.write("frame.exr", {"": np.zeros((6, 8, 3)), "normal": np.ones((6, 8, 3))})
+    >>> exr.read("frame.exr")["normal"].shape
+    (6, 8, 3)
+
+    Files of one part or several are read, in scan lines or tiles; an array is the data window,
+    at full resolution. A channel that belongs to no colour or vector, such as a bare `Z`, is a
+    layer under its full name. To a channel of a second or later part the part's name is
+    prefixed, if it has no dot. If several parts share a name with a dot, the part's view is
+    inserted, or, where views do not differ, the part's name prefixed: the depths of two views
+    in two parts are `depth.left` and `depth.right`.
+
+    EXR has no checksum, so `write` stores one in the header: any bit that flips in its files is
+    noticed. In a file of another program, damage that makes another valid file is not.
     """
     return assemble(path, read_planes(path, max_pixels, verify)[0])

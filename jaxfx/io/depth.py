@@ -1,4 +1,4 @@
-"""Images of depth or disparity from any file, as the numbers that it stores."""
+"""Depth or disparity from image files, as the numbers that they store."""
 
 import re
 from io import BytesIO
@@ -14,38 +14,44 @@ from jaxfx.exr.rgbd import choose, depths_of, flat
 from jaxfx.io.color import EXR, JPEG, PNG
 
 
+# The first bytes of NPY files, and of NPZ files, which are ZIP archives.
 _NPY, _ZIP = b"\x93NUMPY", b"PK\x03\x04"
 # "Pf", width, height and scale, each ended by one or more blanks, the last by exactly one.
 _PFM = re.compile(rb"(P[fF]4?)\s+(\d+)\s+(\d+)\s+([-+0-9.eE]+)\s")
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-# Greys that Pillow gives as the file has them; it spreads those of fewer bits.
+# Pillow's layouts of grey that it decodes as stored; it scales greys of fewer bits to 8.
 _GREYS = ("L", "I;16B")
 
 
 def read_depth(path: StrPath, *, layer: str | None = None) -> Num[np.ndarray, "height width"]:
-    """Read the numbers of a depth, a ray distance or a disparity as the file stores them.
+    """Read a depth, ray distance or disparity as the numbers that the file stores.
 
-    What they mean is for `jaxfx.depth` to say: no curve is applied, no unit, and holes are as
-    they were.
-
-    >>> depth.clean(io.read_depth("kinect.png"), scale=1 / 5000)  # doctest: +SKIP
+    `jaxfx.depth` converts them: here no curve or unit is applied, and holes stay as they are.
 
     **Arguments:**
 
-    - `path`: a PNG file of grey (8 or 16 bits), an EXR file, PFM, NPY, or an NPZ file with
-      one array or one named `depth`. What it is, its first bytes say, not its name.
-    - `layer`: of an EXR file with several layers the one whose pass `Depth` (or `Z`) is
-      wanted, as for `exr.read_rgbd`. A file with no such pass must hold one grey image: a
-      channel alone, or colours that are all alike.
+    - `path`: a PNG file of grey (8 or 16 bits), an EXR, PFM or NPY file, or an NPZ file with
+      one array or one called `depth`. The format is recognised by the first bytes.
+    - `layer`: the layer of an EXR file whose pass `Depth` (or `Z`) is read, as for
+      `exr.read_rgbd`. A file without such a pass must hold one grey image: one channel, or
+      three that are equal.
 
-    **Returns:** height width, in the type of the file: integers from PNG, floats from EXR and
-    PFM, either from NPY. PFM begins with the bottom row, which is put in its place; the number
-    in its header tells the order of bytes, and is not applied.
+    **Returns:** height width, row 0 at the top, in the file's type: integers from PNG, floats
+    from EXR and PFM, either from NPY. The scale in a PFM file's header is not applied.
 
-    **Raises:** `ValueError` that names the file where it is damaged, of another format, of
+    **Raises:** `ValueError` that names the file where it is damaged, of another format, has
     colours, a palette or alpha, or has several layers; `OSError` where it can't be opened.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import depth, io
+    >>> np.save("millimetres.npy", np.full((6, 8), 2500, np.uint16))
+    >>> millimetres = io.read_depth("millimetres.npy")
+    >>> print(depth.clean(millimetres, scale=1e-3)[0, 0])
+    2.5
     """
     data = Path(path).read_bytes()
     if data.startswith(EXR):
@@ -59,16 +65,14 @@ def read_depth(path: StrPath, *, layer: str | None = None) -> Num[np.ndarray, "h
     elif data.startswith((b"Pf", b"PF")):
         array = _from_pfm(path, data)
     else:
-        hint = ": what JPEG stores is not exact" if data.startswith(JPEG) else ""
-        found = f"one that begins with {data[:4]!r}" if data else "an empty one"
-        raise ValueError(
-            f"`{path}` must be a PNG, EXR, PFM, NPY or NPZ file, got {found}{hint}."
-        )
+        hint = ": JPEG does not store exact numbers" if data.startswith(JPEG) else ""
+        got = f"one that begins with {data[:4]!r}" if data else "an empty one"
+        raise ValueError(f"`{path}` must be a PNG, EXR, PFM, NPY or NPZ file, got {got}{hint}.")
     return _one_channel(path, array)
 
 
 def _one_channel(path: StrPath, array: np.ndarray) -> np.ndarray:
-    """`array` as height width; colours that are all alike are one."""
+    """`array` as height width: one channel, or three that are equal; else `ValueError`."""
     if array.ndim == 3 and array.shape[2] in (1, 3) and (array == array[..., :1]).all():
         array = array[..., 0]
     is_real = array.dtype.kind in "fiu"
@@ -81,11 +85,11 @@ def _one_channel(path: StrPath, array: np.ndarray) -> np.ndarray:
 
 
 def _from_exr(path: StrPath, layer: str | None) -> np.ndarray:
+    """The pass `Depth` of a layer, or the file's only image where it has no such pass."""
     layers = exr.read(path)
     depths = depths_of(layers)
     if depths or layer is not None:
         return flat(layers[depths[choose(path, "a depth", depths, layer)]])
-    # No pass of that name: a single image, of grey.
     if [*layers] not in ([""], ["R"], ["V"]):
         raise ValueError(f"`{path}` must have a pass `Depth` or `Z`, got {sorted(layers)}.")
     (array,) = layers.values()
@@ -93,18 +97,19 @@ def _from_exr(path: StrPath, layer: str | None) -> np.ndarray:
 
 
 def _from_png(path: StrPath, data: bytes) -> np.ndarray:
+    """The codes of a grey PNG file, uint8 or uint16; of three equal channels, all three."""
     with needs("io"):
         from PIL import Image
 
     try:
-        picture = Image.open(BytesIO(data), formats=("PNG",))
-        layout, mode = picture.tile[0][3], picture.mode
-        array = np.asarray(picture)
+        image = Image.open(BytesIO(data), formats=("PNG",))
+        layout, mode = image.tile[0][3], image.mode
+        array = np.asarray(image)
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
     if layout == "RGB" and (array == array[..., :1]).all():
         return array
-    if layout not in _GREYS or "transparency" in picture.info:
+    if layout not in _GREYS or "transparency" in image.info:
         raise ValueError(
             f"`{path}` must be of grey, 8 or 16 bits, without alpha, to be a depth, got a PNG "
             f"of {'a palette' if mode == 'P' else layout}."
@@ -113,6 +118,7 @@ def _from_png(path: StrPath, data: bytes) -> np.ndarray:
 
 
 def _from_numpy(path: StrPath, data: bytes) -> np.ndarray:
+    """The array of an NPY file; of NPZ the only one, or `depth`."""
     try:
         loaded = np.load(BytesIO(data), allow_pickle=False)
         if isinstance(loaded, np.ndarray):
@@ -120,19 +126,20 @@ def _from_numpy(path: StrPath, data: bytes) -> np.ndarray:
         arrays = {name: loaded[name] for name in loaded.files}
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not of NumPy: {error}") from error
-    chosen = arrays if len(arrays) == 1 else arrays.keys() & {"depth"}
-    if not chosen:
+    names = arrays if len(arrays) == 1 else arrays.keys() & {"depth"}
+    if not names:
         raise ValueError(
-            f"`{path}` must have one array, or one named `depth`, got {sorted(arrays)}."
+            f"`{path}` must have one array, or one called `depth`, got {sorted(arrays)}."
         )
-    return arrays[next(iter(chosen))]
+    return arrays[next(iter(names))]
 
 
 def _from_pfm(path: StrPath, data: bytes) -> np.ndarray:
-    """Rows from the bottom; a scale below 0 says that the low byte comes first.
+    """The pixels of a PFM file, float32, row 0 at the top: the file begins with the bottom row.
 
-    Its size is not applied. Middlebury's disparities have 1 / 255 there, for viewers; other
-    programs multiply by it, or divide.
+    The scale in the header is negative where the low byte comes first. Its magnitude is not
+    applied: in Middlebury's disparities it is 1 / 255, for viewers; programs differ in whether
+    they multiply or divide by it.
     """
     header = _PFM.match(data)
     if not header:
@@ -140,10 +147,10 @@ def _from_pfm(path: StrPath, data: bytes) -> np.ndarray:
     kind, width, height, number = header.groups()
     shape = int(height), int(width), 3 if kind == b"PF" else 1
     body = data[header.end() :]
-    # Anything but a number above or below 0 leaves the order of bytes open.
+    # The byte order is unknown unless the scale is a number other than 0.
     factor = float(number) if _NUMBER.fullmatch(number) else 0.0
-    is_whole = len(body) == 4 * shape[0] * shape[1] * shape[2]
-    if kind.endswith(b"4") or not is_whole or not 0 < abs(factor) < float("inf"):
+    is_complete = len(body) == 4 * shape[0] * shape[1] * shape[2]
+    if kind.endswith(b"4") or not is_complete or not 0 < abs(factor) < float("inf"):
         raise ValueError(
             f"`{path}` is damaged: its header {header.group()!r} does not fit its {len(body)} "
             "bytes of pixels."

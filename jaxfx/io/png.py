@@ -1,75 +1,31 @@
-"""PNG files, and the sRGB curve that screens want."""
+"""PNG files: the numbers that they store, and images in linear light.
 
-from collections.abc import Callable
+`jaxfx.scene` reads textures by `png_values`.
+"""
+
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfx._checks import as_numpy
+from jaxfx._arrays import ArrayLike
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
-from jaxfx.io._pixels import log_profile, png_values
+from jaxfx.io.srgb import linear_from_srgb, log_profile, recolor, srgb_from_linear
 
 
-# The gamma that files give to say sRGB.
+# The gamma that a file states to mean sRGB, and how far, relative to it, another one may be and
+# still mean it: files round to a few digits.
 _SRGB_GAMMA = 1 / 2.2
-
-
-def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The sRGB curve: from linear light to what a screen is sent.
-
-    **Arguments:** `linear`: any shape; 0 is black, 1 the screen's white.
-
-    **Returns:** the same type and shape, not clipped: outside [0, 1] the curve goes on.
-
-    **Raises:** `ValueError` for integers.
-
-    **Gradient:** none; the host side.
-
-    Source: IEC 61966-2-1, the piecewise curve.
-    """
-    values, dtype = _floats("srgb_from_linear(linear)", linear)
-    power = np.maximum(values, 0.0031308) ** (1 / 2.4)
-    curve = np.where(values <= 0.0031308, 12.92 * values, 1.055 * power - 0.055)
-    return curve.astype(dtype)
-
-
-def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The inverse of `srgb_from_linear`.
-
-    **Arguments:** `srgb`: any shape, 0 to 1.
-
-    **Returns:** linear light, the same type and shape, not clipped.
-
-    **Raises:** `ValueError` for integers: 8-bit numbers are to be divided by 255 first.
-
-    **Gradient:** none; the host side.
-
-    Source: IEC 61966-2-1, the piecewise curve.
-    """
-    values, dtype = _floats("linear_from_srgb(srgb)", srgb)
-    power = ((np.maximum(values, 0.04045) + 0.055) / 1.055) ** 2.4
-    curve = np.where(values <= 0.04045, values / 12.92, power)
-    return curve.astype(dtype)
-
-
-def _floats(name: str, values: Any) -> tuple[np.ndarray, np.dtype]:
-    """Numbers to compute a curve of, in float32 at least, and their own type."""
-    array = as_numpy(name, values)
-    if array.dtype.kind in "biu":
-        raise ValueError(
-            f"`{name}` must hold floats, 1 for the largest, got {array.dtype}. Divide 8-bit "
-            "numbers by 255 and 16-bit ones by 65535."
-        )
-    return array.astype(np.result_type(array.dtype, np.float32)), array.dtype
+_GAMMA_TOLERANCE = 0.05
 
 
 def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) -> None:
-    """Write an 8-bit sRGB picture, whole or not at all.
+    """Write an 8-bit sRGB PNG file of an image in linear light.
+
+    It is written whole or not at all.
 
     **Arguments:**
 
@@ -78,11 +34,18 @@ def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) ->
       clipped to [0, 1] and rounded to the nearest of 256; NaN becomes 0. Alpha is stored
       linear.
 
-    **Raises:** `ValueError` for anything but an image of 1 to 4 channels, or a name that ends
-    in another suffix than `.png`; `OSError` where the folder does not exist or can't be
-    written.
+    **Raises:** `ValueError` for anything but an image of 1 to 4 channels, or a path with
+    another suffix than `.png`; `OSError` where the folder does not exist or can't be written.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import io
+    >>> io.write_png("grey.png", np.full((6, 8, 3), 0.18))
+    >>> print(io.read_png("grey.png")[0, 0].round(2))
+    [0.18 0.18 0.18]
     """
     with needs("io"):
         from PIL import Image
@@ -102,46 +65,83 @@ def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) ->
 
 
 def read_png(path: StrPath) -> Float[np.ndarray, "height width channel"]:
-    """Read a PNG image of colours into linear light.
+    """Read a PNG image into linear light, at its full 8 or 16 bits.
 
-    An image of depth is none of colours: `read_depth` gives its numbers as they are.
+    `read_depth` reads a PNG of depth: its numbers are not colours.
 
-    **Arguments:** `path`: a PNG file. Its numbers are taken for sRGB, or undone of the gamma
-    that the file names; alpha is linear. A colour profile in the file is not heeded, which is
-    logged where it is not sRGB.
+    **Arguments:** `path`: a PNG file. Its numbers are taken for sRGB, unless the file states
+    another gamma; alpha is linear. A colour profile is not applied, which is logged where it is
+    not sRGB.
 
-    **Returns:** float32, height width channel, in [0, 1]: grey, grey and alpha, RGB or RGBA,
-    as in the file, 16 bits in full; a palette is looked up, and a colour that the file calls
-    transparent has alpha 0.
+    **Returns:** float32, height width channel, in [0, 1]: grey, grey and alpha, RGB or RGBA, as
+    in the file. A palette is looked up; a colour declared transparent has alpha 0.
 
     **Raises:** `ValueError` that names the file where it is damaged or not PNG; `OSError` where
     it can't be opened.
 
     **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import io
+    >>> io.write_png("ramp.png", np.linspace(0, 1, 48).reshape(6, 8, 1))
+    >>> io.read_png("ramp.png").shape
+    (6, 8, 1)
     """
     return decode_png(path, Path(path).read_bytes())
 
 
 def decode_png(path: StrPath, data: bytes) -> np.ndarray:
-    """The image of a PNG file; `path` is for errors."""
+    """The bytes of a PNG file as an image in linear light; `path` names it in errors."""
     with needs("io"):
         from PIL import Image
 
     try:
         values = png_values(data)
-        facts = Image.open(BytesIO(data), formats=("PNG",)).info
+        info = Image.open(BytesIO(data), formats=("PNG",)).info
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not PNG: {error}") from error
-    log_profile(path, facts)
-    gamma = facts.get("gamma", _SRGB_GAMMA)
-    if "srgb" in facts or abs(gamma / _SRGB_GAMMA - 1) < 0.05:
+    log_profile(path, info)
+    gamma = info.get("gamma", _SRGB_GAMMA)
+    if "srgb" in info or abs(gamma / _SRGB_GAMMA - 1) < _GAMMA_TOLERANCE:
         return recolor(linear_from_srgb, values).astype(np.float32)
     if not gamma > 0:
         raise ValueError(f"`{path}` must have a gamma above 0, got {gamma}.")
     return recolor(lambda codes: codes ** (1 / gamma), values).astype(np.float32)
 
 
-def recolor(curve: Callable[[np.ndarray], np.ndarray], values: np.ndarray) -> np.ndarray:
-    """`curve` on the colours of an image, not on its alpha."""
-    colors = 3 if values.shape[2] > 2 else 1
-    return np.concatenate([curve(values[:, :, :colors]), values[:, :, colors:]], axis=2)
+def png_values(data: bytes) -> np.ndarray:
+    """The codes of a PNG file divided by the largest, height width channel, in [0, 1]."""
+    with needs("io"):
+        from PIL import Image
+
+    def pixels(layout: str = "") -> np.ndarray:
+        image: Any = Image.open(BytesIO(data), formats=("PNG",))
+        if layout:
+            image.tile = [(*image.tile[0][:3], layout)]
+        palette = "RGBA" if "transparency" in image.info else "RGB"
+        mode = {"1": "L", "P": palette}.get(image.mode, image.mode)
+        array = np.asarray(image.convert(mode) if mode != image.mode else image)
+        return array.reshape(*array.shape[:2], -1).astype(np.float64)
+
+    # Of 16-bit RGB, Pillow keeps the high bytes. Told that the byte order is the other one, it
+    # keeps the low bytes. 16-bit grey and alpha, read as 8-bit RGBA, has both bytes of both.
+    header = Image.open(BytesIO(data), formats=("PNG",))
+    layout = str(header.tile[0][3])
+    largest = 65535 if "16" in layout else 255
+    if layout == "LA;16B":
+        high_low = pixels("RGBA")
+        codes = 256 * high_low[:, :, ::2] + high_low[:, :, 1::2]
+    elif layout in ("RGB;16B", "RGBA;16B"):
+        codes = 256 * pixels() + pixels(layout[:-1] + "L")
+    else:
+        codes = pixels()
+    # A file without alpha may declare one colour transparent. Pillow scales greys of 2 and 4
+    # bits to 8 bits, but not that colour.
+    key = header.info.get("transparency")
+    if key is not None and header.mode != "P":
+        key = np.atleast_1d(key) * {"L;2": 85, "L;4": 17}.get(layout, 1)
+        is_opaque = np.any(codes != key, axis=2, keepdims=True)
+        codes = np.concatenate([codes, largest * is_opaque], axis=2)
+    return codes / largest

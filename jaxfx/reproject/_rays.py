@@ -80,7 +80,7 @@ def _lines(
     else:
         apart = lens @ (apart + jnp.eye(3, dtype=dtype))
         own, eye = (zero, zero, zero), lens @ (turn @ away)
-        scale, centre = target.pixels_per_unit.astype(dtype), target.centre.astype(dtype)
+        scale, centre = target.pixels_per_unit.astype(dtype), target.center.astype(dtype)
         plane = (x - centre[0]) / scale / unit, (y - centre[1]) / scale / unit
         x, y = zero, zero
     far_x, far_y, far_z = (

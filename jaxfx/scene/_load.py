@@ -1,4 +1,4 @@
-"""Mesh files, and meshes in memory, to scenes."""
+"""Scenes from mesh files, and from meshes in memory."""
 
 import logging
 import os
@@ -8,42 +8,50 @@ from typing import Any
 import numpy as np
 
 from jaxfx._extras import MissingExtraError, needs
-from jaxfx.scene import _gltf, _obj, _off, _ply, _trimesh
-from jaxfx.scene._gltf_data import is_glb
 from jaxfx.scene._part import UnreadableError, assemble
 from jaxfx.scene._scene import Scene
+from jaxfx.scene.formats import by_trimesh, gltf, obj, off, ply
+from jaxfx.scene.formats._gltf_document import is_glb
 
 
 _logger = logging.getLogger("jaxfx.scene")
 _READERS = {
-    ".gltf": _gltf,
-    ".glb": _gltf,
-    ".obj": _obj,
-    ".ply": _ply,
-    ".off": _off,
+    ".gltf": gltf,
+    ".glb": gltf,
+    ".obj": obj,
+    ".ply": ply,
+    ".off": off,
 }
 
 
 def load(path: str | os.PathLike[str]) -> Scene:
-    """Read a mesh file, with its node transforms, textures and colours.
+    """Read a mesh file with its node transforms, textures, materials and colours.
 
-    glTF, GLB, OBJ with MTL, PLY and OFF are read here; STL and the rest by trimesh.
-    `docs/meshes.md` lists what of each format is honoured, refused and left out; what is left
-    out of a file is also told to the logger `jaxfx.scene`, in one message. Images and the
-    colours of OBJ and PLY files are taken to be sRGB; glTF's factors and vertex colours are
-    linear, as its standard says. An OBJ material's exponent Ns becomes the roughness
-    sqrt(2 / (Ns + 2)), and 1 where it has no highlight.
+    glTF, GLB, OBJ with MTL, PLY and OFF are read here; STL and other formats by trimesh.
 
-    **Arguments:** `path`: the file. Other files that it names are looked for as it says,
-    relative to the file that names them.
+    **Arguments:** `path`: the file. Paths in it are relative to the file that holds them.
 
-    **Returns:** the `Scene`, in the file's own axes and units.
+    **Returns:** the `Scene`, in the file's axes and units.
 
-    **Raises:** `FileNotFoundError` where there is no such file; `ValueError` that names it
-    where it can't be read, needs an image, a library or an extension that is not there, has no
-    triangle, or a number in it is not finite.
+    **Raises:** `FileNotFoundError` where there is no such file; `ValueError` that names the
+    file where it can't be read, an image, MTL file or extension that it needs is missing, it
+    has no triangle, or a number in it is not finite.
 
-    **Gradient:** none: this runs on the host.
+    **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import trimesh
+    >>> from jaxfx import scene
+    >>> _ = trimesh.creation.box((1, 2, 3)).export("box.ply")
+    >>> scene.load("box.ply")
+    Scene(12 triangles, 1 objects, 1 x 2 x 3)
+
+    `docs/meshes.md` lists what of each format is read, refused and left out. What is left out
+    of a file is logged to `jaxfx.scene`, in one message. Images and the colours of OBJ and PLY
+    files are taken to be sRGB; glTF's factors and vertex colours are linear, by its standard.
+    An OBJ material's exponent Ns becomes the roughness sqrt(2 / (Ns + 2)); without a highlight
+    the roughness is 1.
 
     Source: glTF 2.0 (Khronos 2017); Wavefront OBJ and MTL; PLY (Turk 1994); Geomview's OFF.
     """
@@ -53,8 +61,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
     file = Path(name)
     try:
         data = file.read_bytes()
-        reader = _gltf if is_glb(data) else _READERS.get(file.suffix.lower(), _trimesh)
-        with np.errstate(all="ignore"):  # what comes of it is not finite, and found
+        reader = gltf if is_glb(data) else _READERS.get(file.suffix.lower(), by_trimesh)
+        with np.errstate(all="ignore"):  # `assemble` refuses what is not finite.
             parts, ignored = reader.read(file, data)
     except MissingExtraError:
         raise
@@ -70,23 +78,30 @@ def load(path: str | os.PathLike[str]) -> Scene:
 
 
 def from_trimesh(mesh: Any, *, smooth: bool | None = None) -> Scene:
-    """A scene from a `trimesh.Trimesh` or `trimesh.Scene` in memory.
+    """A scene from a `trimesh.Trimesh` or `trimesh.Scene` in memory, with its materials.
 
     **Arguments:**
 
     - `mesh`: the mesh or scene, in any unit of length; it is read, not kept. Its vertex and
-      face colours are taken to be sRGB. trimesh keeps them as bytes: of colours of more bits,
-      as of uint16, it has lost the upper ones.
-    - `smooth`: whether corners have `mesh.vertex_normals`; without it each face is flat. None:
-      where the mesh was given normals of its own, which are told by not being those that
-      trimesh makes of its faces.
+      face colours are taken to be sRGB. trimesh stores them as bytes: of wider colours, such as
+      uint16, it has lost the upper bits.
+    - `smooth`: True uses `mesh.vertex_normals` at the corners, False makes every face flat.
+      None is True for a mesh that came with normals: those that differ from the ones which
+      trimesh computes from the faces.
 
     **Returns:** the `Scene`.
 
     **Raises:** `ValueError` for another type, no triangle, a number that is not finite, an
     image of neither 8 nor 16 bits, or colours of a PLY file that trimesh has cut to bytes.
 
-    **Gradient:** none: this runs on the host.
+    **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import trimesh
+    >>> from jaxfx import scene
+    >>> scene.from_trimesh(trimesh.creation.box((1, 2, 3)))
+    Scene(12 triangles, 1 objects, 1 x 2 x 3)
     """
     with needs("scene"):
         import trimesh
@@ -99,7 +114,7 @@ def from_trimesh(mesh: Any, *, smooth: bool | None = None) -> Scene:
             f"got {type(mesh).__name__}."
         )
     try:
-        parts = list(_trimesh.parts(mesh, smooth=smooth))
+        parts = list(by_trimesh.parts(mesh, smooth=smooth))
     except UnreadableError as error:
         raise ValueError(f"`scene.from_trimesh(mesh)` can't be taken over: {error}.") from error
     return assemble(parts, "scene.from_trimesh(mesh)")

@@ -1,4 +1,4 @@
-"""Parts: triangles on their way from a reader into a scene."""
+"""Parts: what a reader of mesh files returns, and how parts become a scene."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -10,6 +10,10 @@ from jaxfx.scene._material import Material
 from jaxfx.scene._scene import Scene
 
 
+# The material of surfaces to which a file assigns none: a light grey.
+UNASSIGNED = Material(color=(0.8, 0.8, 0.8))
+
+
 class UnreadableError(Exception):
     """Why a file can't be read; `load` puts the file's name before it."""
 
@@ -17,8 +21,8 @@ class UnreadableError(Exception):
 class Part(NamedTuple):
     """Triangles of one object or of several, in world space.
 
-    `names` and `face_objects` are as in `Scene`; parts that share a name are one object. None
-    stands for the faces' own normals, for no coordinates and for white.
+    Fields are as in `Scene`; parts that share a name are one object. None in `normals` stands
+    for flat faces, in `uv` and `second_uv` for no texture coordinates, in `colors` for white.
     """
 
     vertices: Float[np.ndarray, "vertex 3"]
@@ -34,7 +38,7 @@ class Part(NamedTuple):
 
 
 def unit(vectors: Float[np.ndarray, "*any 3"]) -> Float[np.ndarray, "*any 3"]:
-    """Vectors of length 1; 0 stays 0."""
+    """Vectors divided by their length; 0 stays 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1)
 
@@ -42,7 +46,7 @@ def unit(vectors: Float[np.ndarray, "*any 3"]) -> Float[np.ndarray, "*any 3"]:
 def flat_normals(
     vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
 ) -> Float[np.ndarray, "face 3 3"]:
-    """Each face's normal at its corners, twice its area long."""
+    """Each face's normal, of twice the face's area in length, at its three corners."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     return np.repeat(np.cross(b - a, c - a)[:, None], 3, axis=1)
 
@@ -50,9 +54,10 @@ def flat_normals(
 def turned_normals(
     normals: Float[np.ndarray, "*any 3"], matrices: Float[np.ndarray, "... 3 3"]
 ) -> Float[np.ndarray, "*any 3"]:
-    """Unit normals of surfaces that `matrices`, one or one a normal, transform; 0 stays 0.
+    """Unit normals of surfaces after the linear maps `matrices`: one, or one per normal.
 
-    The transpose of the adjugate turns them as the inverse's does, and bears a flat scaling.
+    Normals transform by the inverse transpose. The cofactor matrix used here is that times the
+    determinant, and exists for a singular matrix too. A normal of length 0 stays 0.
     """
     a, b, c = np.moveaxis(matrices, -1, 0)
     rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
@@ -60,7 +65,7 @@ def turned_normals(
 
 
 def placed(part: Part, transform: Float[np.ndarray, "4 4"]) -> Part:
-    """`part` moved; a mirror keeps the faces' fronts."""
+    """`part` under an affine transform. A mirroring one keeps the faces' fronts outside."""
     matrix = transform[:3, :3]
     part = part._replace(vertices=part.vertices @ matrix.T + transform[:3, 3])
     if part.normals is not None:
@@ -69,7 +74,7 @@ def placed(part: Part, transform: Float[np.ndarray, "4 4"]) -> Part:
 
 
 def flipped(part: Part) -> Part:
-    """`part` with every face's corners in the other order."""
+    """`part` with every face's corners in reverse order, so that front and back change."""
     corners = {
         name: None if getattr(part, name) is None else getattr(part, name)[:, [0, 2, 1]]
         for name in ("faces", "normals", "uv", "second_uv", "colors")
@@ -78,17 +83,17 @@ def flipped(part: Part) -> Part:
 
 
 def unique_name(name: str, taken: set[str]) -> str:
-    """`name`, or with a number behind it where it is taken; it is taken from now on."""
-    found, count = name, 0
-    while found in taken:
+    """`name`, or `name_1`, `name_2`, ... where `taken` has it; the result is added there."""
+    unique, count = name, 0
+    while unique in taken:
         count += 1
-        found = f"{name}_{count}"
-    taken.add(found)
-    return found
+        unique = f"{name}_{count}"
+    taken.add(unique)
+    return unique
 
 
 def assemble(parts: Iterable[Part], caller: str) -> Scene:
-    """The scene of all parts; `ValueError` names `caller` where they make none."""
+    """All parts as one scene; `ValueError` names `caller` where they hold no triangle."""
     parts = [part for part in parts if len(part.faces)]
     if not parts:
         raise ValueError(f"`{caller}` must hold at least one triangle, got none.")
@@ -102,20 +107,20 @@ def assemble(parts: Iterable[Part], caller: str) -> Scene:
         objects = [names.setdefault(name, len(names)) for name in part.names]
         for material in part.materials:
             materials.setdefault(id(material), material)
-        place = {key: index for index, key in enumerate(materials)}
-        chosen = [place[id(material)] for material in part.materials]
+        index_of = {key: index for index, key in enumerate(materials)}
+        material_indices = [index_of[id(material)] for material in part.materials]
         normals = part.normals
         if normals is None:
             normals = unit(flat_normals(part.vertices, part.faces))
-        bare = np.zeros((count, 3, 2))
+        no_uv = np.zeros((count, 3, 2))
         for name, value in {
             "vertices": part.vertices,
             "faces": part.faces + offset,
             "normals": normals,
-            "uv": bare if part.uv is None else part.uv,
-            "second_uv": bare if part.second_uv is None else part.second_uv,
+            "uv": no_uv if part.uv is None else part.uv,
+            "second_uv": no_uv if part.second_uv is None else part.second_uv,
             "colors": np.ones((count, 3, 3)) if part.colors is None else part.colors,
-            "face_materials": np.asarray(chosen)[part.face_materials],
+            "face_materials": np.asarray(material_indices)[part.face_materials],
             "face_objects": np.asarray(objects)[part.face_objects],
         }.items():
             columns.setdefault(name, []).append(value)
@@ -137,6 +142,7 @@ def assemble(parts: Iterable[Part], caller: str) -> Scene:
 
 
 def _require_finite(part: Part, caller: str) -> None:
+    """Raise `ValueError` that names the first vertex which is not finite."""
     wrong = ~np.isfinite(part.vertices).all(axis=1)
     if wrong.any():
         raise ValueError(

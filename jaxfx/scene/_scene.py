@@ -1,4 +1,4 @@
-"""A scene: triangles with their attributes and materials, as NumPy arrays."""
+"""A scene: triangles with their attributes and materials, in NumPy arrays."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,47 +11,72 @@ from jaxfx.scene._material import Material
 
 
 class Viewpoint(NamedTuple):
-    """Where a scene is seen well from.
+    """A view that suits a scene: `default_camera` takes it.
 
     **Arguments:**
 
-    - `eye`, `target`: world positions, 3.
-    - `fov`: the field of view of the picture's shorter side, in radians.
+    - `eye`, `at`: world positions, 3: of the camera, and of what it looks at.
+    - `fov`: field of view along the shorter side of the image, in radians.
 
-    **Gradient:** none.
+    **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> from jaxfx import scene
+    >>> scene.Viewpoint(eye=(0.0, 1.0, 0.0), at=(0.0, 0.0, -3.0), fov=0.8).at
+    (0.0, 0.0, -3.0)
     """
 
     eye: tuple[float, float, float]
-    target: tuple[float, float, float]
+    at: tuple[float, float, float]
     fov: float
 
 
 @final
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Scene:
-    """Triangles in world space, with what their surfaces look like.
+    """Triangles in world space with normals, texture coordinates, colours and materials.
 
-    World axes are the mesh file's own (y up in most of them). The arrays are copied and
-    read-only, for the backends keep what they build from them.
+    `load`, `from_trimesh` and `still_life` make one, or arrays of your own. World axes are the
+    mesh file's (y up in most of them). The arrays are copied and read-only, since the backends
+    keep what they build from them.
 
     **Arguments:**
 
     - `vertices`: vertex 3, world positions, in scene units.
-    - `faces`: face 3, indices of vertices; counter-clockwise seen from the front.
+    - `faces`: face 3, indices of vertices, counter-clockwise seen from the front.
     - `normals`: face 3 3, each corner's normal, in world space. Their sign does not matter.
     - `uv`: face 3 2, each corner's texture coordinates; v points up, and the image covers
       [0, 1] of both.
     - `colors`: face 3 3, each corner's linear RGB, which multiplies the material's.
     - `materials`, `face_materials`: the materials, and every face's index into them.
     - `names`, `face_objects`: the objects' names, and every face's index into them.
-    - `viewpoint`: what `default_camera` takes, where the scene knows better than its box.
-    - `second_uv`: face 3 2, the coordinates of textures whose `Sampler` asks for a second set;
-      or None.
+    - `viewpoint`: the view that `default_camera` takes, or None for one by the bounding box.
+    - `second_uv`: face 3 2, a second set of texture coordinates, for textures whose `Sampler`
+      has `use_second_uv`; or None.
 
-    **Raises:** `ValueError` where there is no triangle, a number is not finite, or the arrays
-    do not fit one another.
+    **Raises:** `ValueError` where there is no triangle, a number is not finite, or shapes and
+    indices do not fit one another.
 
-    **Gradient:** none: scenes live on the host, in NumPy.
+    **Gradient:** none; the host side.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import scene
+    >>> triangle = scene.Scene(
+    ...     vertices=np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
+    ...     faces=np.array([[0, 1, 2]]),
+    ...     normals=np.broadcast_to([0.0, 0, 1], (1, 3, 3)),
+    ...     uv=np.zeros((1, 3, 2)),
+    ...     colors=np.ones((1, 3, 3)),
+    ...     materials=(scene.Material(),),
+    ...     face_materials=np.array([0]),
+    ...     names=("triangle",),
+    ...     face_objects=np.array([0]),
+    ... )
+    >>> triangle
+    Scene(1 triangles, 1 objects, 1 x 1 x 0)
     """
 
     vertices: Float[np.ndarray, "vertex 3"]
@@ -87,7 +112,7 @@ class Scene:
                 raise ValueError(
                     f"`Scene({name}=...)` must have shape {shape}, got {np.shape(value)}."
                 )
-            with np.errstate(over="ignore"):  # found by the next check
+            with np.errstate(over="ignore"):  # The next check refuses what overflows.
                 copied = np.array(value, dtype, order="C")
             self._require_finite(name, copied)
             copied.flags.writeable = False
@@ -95,13 +120,14 @@ class Scene:
         self._require_index("faces", len(self.vertices))
         self._require_index("face_materials", len(self.materials))
         self._require_index("face_objects", len(self.names))
-        asked = [s for each in self.materials for s in each.samplers.values() if s.second_uv]
-        if asked and self.second_uv is None:
+        samplers = [s for material in self.materials for s in material.samplers.values()]
+        if self.second_uv is None and any(sampler.use_second_uv for sampler in samplers):
             raise ValueError(
-                "`Scene(second_uv=...)` must be given for a `Sampler` that reads it, got None."
+                "`Scene(second_uv=...)` must be given for a `Sampler` that uses it, got None."
             )
 
     def _require_finite(self, name: str, value: np.ndarray) -> None:
+        """Raise `ValueError` that names the first vertex or face which is not finite."""
         wrong = ~np.isfinite(value).reshape(len(value), -1).all(axis=1)
         if wrong.any():
             item = "vertex" if name == "vertices" else "face"
@@ -111,6 +137,7 @@ class Scene:
             )
 
     def _require_index(self, name: str, count: int) -> None:
+        """Raise `ValueError` unless all values of a field are in [0, count)."""
         value = getattr(self, name)
         if value.min() < 0 or value.max() >= count:
             raise ValueError(
@@ -124,7 +151,7 @@ class Scene:
 
     @cached_property
     def points(self) -> Float[np.ndarray, "point 3"]:
-        """The vertices that a face uses: point 3."""
+        """The vertices that faces use: point 3, world positions."""
         return self.vertices[np.unique(self.faces)]
 
     @cached_property
@@ -134,7 +161,7 @@ class Scene:
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property
-    def centre(self) -> Float[np.ndarray, "3"]:
+    def center(self) -> Float[np.ndarray, "3"]:
         """The middle of the bounding box: 3, a world position."""
         return self.bounds.mean(axis=0)
 
@@ -144,16 +171,16 @@ class Scene:
         return self.bounds[1] - self.bounds[0]
 
     @property
-    def scale(self) -> float:
-        """Half the bounding box's diagonal, in scene units; 1 for a box of a single point."""
+    def radius(self) -> float:
+        """Half the diagonal of the bounding box, in scene units; 1 where all is one point."""
         return float(np.linalg.norm(self.extent)) / 2 or 1.0
 
     @cached_property
     def unit_triangles(self) -> Float[np.ndarray, "face 3 3"]:
-        """The corners, face 3 3 in float32, moved and scaled into the ball of radius 1 about 0.
+        """The corners, face 3 3, float32, moved and scaled into the unit ball about the origin.
 
-        Visibility is decided on these, so that float32 is as good for a scene far from the
-        origin or very small as for any other.
+        The backends find visible faces with these. So float32 suffices for scenes that are tiny
+        or far from the origin, too.
         """
-        unit = (self.vertices - self.centre) / self.scale
+        unit = (self.vertices - self.center) / self.radius
         return np.ascontiguousarray(unit.astype(np.float32)[self.faces])

@@ -1,8 +1,8 @@
-"""From the face that a pixel shows to what the surface is like there.
+"""From the face that a pixel shows to the shading parameters of the surface there.
 
-Both backends answer one question only, which face a pixel shows. Depth, normals, textures and
-materials follow here, in float64 where it matters, so that the backends agree wherever they
-see the same face.
+A backend finds only which face each pixel shows. This module computes depth, normals and
+material parameters at the hit, so that both backends agree wherever they find the same face.
+Depth and barycentric weights are in float64.
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,28 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfx.gbuffer import GBuffer
-from jaxfx.scene._color import read_texture
-from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._material import Material, Sampler, sample_texture
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
 
 
-_DIELECTRIC = 0.04  # reflectance of a surface of refractive index 1.5, face on
-_SLACK = 0.05  # how far outside a face depth may be read, in barycentric weight
+# Reflectance at normal incidence of a dielectric of refractive index 1.5, as glTF 2.0 has it.
+_DIELECTRIC = 0.04
+# How far outside its face a hit may lie, in barycentric weight. Less clips the depth of pixels
+# that a rasteriser gave to a face which their centre just misses; more lets the depth of a face
+# seen edge-on run away.
+_SLACK = 0.05
 
 
 class Hits(NamedTuple):
-    """The pixels that show a face, and where on it they look.
+    """The pixels that show a face, and the point of the face that each shows.
 
-    `pixel` is a flat index; `weights` are barycentric, inside the face; `normal` is the face's,
-    unit, on its front; `toward` is the ray's direction. Both are in camera space.
+    - `pixel`: flat index of the pixel.
+    - `face`: index of the face.
+    - `depth`: along the optical axis, in scene units.
+    - `weights`: barycentric, in [0, 1].
+    - `normal`: the face's unit normal, on its front side, in camera space.
+    - `toward`: the ray's direction, of depth 1, in camera space.
     """
 
     pixel: Int[np.ndarray, " hit"]
@@ -39,22 +46,22 @@ class Hits(NamedTuple):
 
     @property
     def front(self) -> Bool[np.ndarray, " hit"]:
-        """Whether the camera sees the face's front, counter-clockwise."""
+        """Whether the camera sees the face's front: its corners run counter-clockwise."""
         return _dot(self.normal, self.toward) < 0
 
 
 def intersect(scene: Scene, view: View, faces: Int[np.ndarray, "height width"]) -> Hits:
-    """Meet every pixel's ray with its own face (-1 for none).
+    """The intersection of every pixel's ray with the face that the pixel shows (-1 for none).
 
-    A rasteriser snaps corners to some 1/256 pixel, and may so give a pixel to a face that its
-    centre just misses. Depth then follows the face's plane, `_SLACK` of the face beyond it and
-    no farther: a face seen edge-on would put the pixel anywhere.
+    A rasteriser snaps corners to about 1/256 pixel, and so may assign a pixel to a face that
+    its centre just misses. The depth is then that of the face's plane, at most `_SLACK` outside
+    the face: in the plane of a face seen edge-on it could be anything.
 
     Source: Möller & Trumbore 1997.
     """
     pixel = np.flatnonzero(faces >= 0)
     face = faces.take(pixel)
-    origin, toward = (each.take(pixel, axis=1) for each in view.rays(*faces.shape))
+    origin, toward = (rays.take(pixel, axis=1) for rays in view.rays(*faces.shape))
     corners = view.to_camera(scene.vertices)
     a, b, c = (corners.take(scene.faces[:, i].take(face), axis=1) for i in range(3))
     ab, ac, offset = b - a, c - a, origin - a
@@ -72,15 +79,16 @@ def intersect(scene: Scene, view: View, faces: Int[np.ndarray, "height width"]) 
 def _at_least(
     least: float | int, weights: Float[np.ndarray, "3 hit"]
 ) -> Float[np.ndarray, "3 hit"]:
+    """Barycentric weights clamped from below, and normalised to the sum 1."""
     weights = np.maximum(weights, least)
     return weights / weights.sum(axis=0)
 
 
 def to_gbuffer(scene: Scene, view: View, hits: Hits, height: int, width: int) -> GBuffer:
-    """The deep frame buffer of the hits; nothing elsewhere."""
+    """The deep frame buffer of the hits; background in all other pixels."""
     color, metallic, roughness = _materials(scene, hits)
-    bare = (1 - metallic)[:, None]
-    specular = _DIELECTRIC * bare + color * metallic[:, None]
+    dielectric = (1 - metallic)[:, None]
+    specular = _DIELECTRIC * dielectric + color * metallic[:, None]
     shader = np.where((roughness < 1) | (metallic > 0), np.int32(2), np.int32(0))
     image = partial(_image, hits.pixel, (height, width))
     base = image(color, 0)
@@ -88,7 +96,7 @@ def to_gbuffer(scene: Scene, view: View, hits: Hits, height: int, width: int) ->
         color=base,
         shader=image(shader, -1),
         ambient=base,
-        diffuse=image(color * bare, 0),
+        diffuse=image(color * dielectric, 0),
         specular=image(specular, 0),
         normal=image(_normals(scene, view, hits).T, 0),
         depth=depth_image(hits, height, width),
@@ -105,10 +113,10 @@ def _image(
     pixel: Int[np.ndarray, " hit"],
     shape: tuple[int, int],
     values: np.ndarray,
-    nothing: int | float,
+    background: int | float,
 ) -> np.ndarray:
-    """`values` at the flat indices `pixel` of an image, `nothing` elsewhere."""
-    full = np.full((shape[0] * shape[1], *values.shape[1:]), nothing, values.dtype)
+    """An image with `values` at the flat indices `pixel`, and `background` elsewhere."""
+    full = np.full((shape[0] * shape[1], *values.shape[1:]), background, values.dtype)
     full[pixel] = values
     return full.reshape(*shape, *values.shape[1:])
 
@@ -116,9 +124,9 @@ def _image(
 def _normals(scene: Scene, view: View, hits: Hits) -> Float[np.ndarray, "3 hit"]:
     """Unit normals in world space that face the camera.
 
-    Interpolated ones are turned to the face's front, bent by the material's map, and turned to
-    the side of the face that is seen. Where they still look away, as at a silhouette, they lose
-    what they have along the ray.
+    The corners' normals are interpolated on the face's front, perturbed by the normal map, and
+    flipped where the camera sees the back. Where one still points away from the camera, as at a
+    silhouette, its component along the ray is removed.
     """
     one = np.float32(1)
     flat = view.turn(hits.normal).astype(np.float32)
@@ -130,57 +138,57 @@ def _normals(scene: Scene, view: View, hits: Hits) -> Float[np.ndarray, "3 hit"]
 def _fronts(
     scene: Scene, hits: Hits, flat: Float[np.ndarray, "3 hit"]
 ) -> Float[np.ndarray, "3 hit"]:
-    """Interpolated unit normals, on the front of faces with normals `flat`, bent by maps."""
+    """Interpolated unit normals with normal maps applied, on the side of the face normals."""
     one = np.float32(1)
     normal = _interpolate(scene.normals, hits.face, hits.weights)
     normal *= np.where(_dot(normal, flat) < 0, -one, one)
-    return _bent(scene, hits, _unit(np.where((normal == 0).all(axis=0), flat, normal)))
+    return _normal_mapped(scene, hits, _unit(np.where((normal == 0).all(axis=0), flat, normal)))
 
 
 def at_hits(
     scene: Scene, hits: Hits
 ) -> tuple[Float[np.ndarray, "hit 3"], Float[np.ndarray, "hit 3"], Float[np.ndarray, " hit"]]:
-    """Normals on the faces' fronts, base colour and metallic; `hits.normal` in world space."""
+    """Front-side normals, base colour and metallic at hits whose `normal` is in world space."""
     color, metallic, _ = _materials(scene, hits)
     return _fronts(scene, hits, hits.normal.astype(np.float32)).T, color, metallic
 
 
-def _bent(
+def _normal_mapped(
     scene: Scene, hits: Hits, normal: Float[np.ndarray, "3 hit"]
 ) -> Float[np.ndarray, "3 hit"]:
-    """`normal`, unit, on the face's front, as the materials' normal maps bend it.
+    """Unit normals on the face's front, perturbed by the materials' normal maps.
 
-    The tangents are each face's own, made orthogonal to the normal. A face whose texture
-    coordinates span no area is not bent.
+    The tangents are computed per face and made orthogonal to the normal. A face whose texture
+    coordinates span no area keeps its normal.
 
     Source: glTF 2.0 (Khronos 2017), 3.9.3; Lengyel 2001 for the tangents.
     """
     index = scene.face_materials.take(hits.face)
-    for each, material in enumerate(scene.materials):
-        at = np.flatnonzero(index == each)
+    for material_index, material in enumerate(scene.materials):
+        at = np.flatnonzero(index == material_index)
         if material.normal_map is None or not len(at):
             continue
         face, up = hits.face[at], normal[:, at]
         sampler = _sampler(material, "normal_map")
-        along_u, along_v, spans = _tangents(scene, face, sampler)
+        along_u, along_v, has_tangents = _tangents(scene, face, sampler)
         tangent = along_u - _dot(up, along_u) * up
         length = np.sqrt(_dot(tangent, tangent))
-        spans &= length > 0
-        tangent = tangent / np.where(spans, length, 1)
-        across = _cross(up, tangent)
-        across = across * np.where(_dot(across, along_v) < 0, -1, 1)
-        x, y, z = 2 * _read(scene, material, "normal_map", face, hits.weights[:, at]).T - 1
+        has_tangents &= length > 0
+        tangent = tangent / np.where(has_tangents, length, 1)
+        bitangent = _cross(up, tangent)
+        bitangent = bitangent * np.where(_dot(bitangent, along_v) < 0, -1, 1)
+        x, y, z = 2 * _sample(scene, material, "normal_map", face, hits.weights[:, at]).T - 1
         scale = np.float32(material.normal_scale)
-        bent = scale * (x * tangent + y * across) + z * up
-        spans &= _dot(bent, bent) > 0
-        normal[:, at] = np.where(spans, _unit(np.where(spans, bent, up)), up)
+        mapped = scale * (x * tangent + y * bitangent) + z * up
+        is_mapped = has_tangents & (_dot(mapped, mapped) > 0)
+        normal[:, at] = np.where(is_mapped, _unit(np.where(is_mapped, mapped, up)), up)
     return normal
 
 
 def _tangents(
     scene: Scene, face: Int[np.ndarray, " hit"], sampler: Sampler
 ) -> tuple[Float[np.ndarray, "3 hit"], Float[np.ndarray, "3 hit"], Bool[np.ndarray, " hit"]]:
-    """The ways in which u and v grow on each face, in world space; and whether they do."""
+    """Per face, the world-space unit directions in which u and v grow; whether they exist."""
     a, b, c = scene.vertices[scene.faces[face]].transpose(1, 2, 0)
     corners = _coordinates(sampler, _uv(scene, sampler)[face].astype(np.float64))
     (u_a, v_a), (u_b, v_b), (u_c, v_c) = corners.transpose(1, 2, 0)
@@ -188,7 +196,8 @@ def _tangents(
     sign = np.sign(area)
     along_u = sign * ((v_c - v_a) * (b - a) - (v_b - v_a) * (c - a))
     along_v = sign * ((u_b - u_a) * (c - a) - (u_c - u_a) * (b - a))
-    unit = lambda way: way / np.maximum(np.sqrt(_dot(way, way)), np.finfo(np.float64).tiny)
+    tiny = np.finfo(np.float64).tiny  # So that a direction of length 0 stays 0.
+    unit = lambda vector: vector / np.maximum(np.sqrt(_dot(vector, vector)), tiny)
     return unit(along_u).astype(np.float32), unit(along_v).astype(np.float32), sign != 0
 
 
@@ -200,28 +209,30 @@ def _materials(
     metallic = np.empty(len(color), np.float32)
     roughness = np.empty(len(color), np.float32)
     index = scene.face_materials.take(hits.face)
-    for each in np.unique(index):
-        material = scene.materials[each]
-        at = np.flatnonzero(index == each)
+    for material_index in np.unique(index):
+        material = scene.materials[material_index]
+        at = np.flatnonzero(index == material_index)
         factor = np.array(material.color, np.float32)
         metallic[at], roughness[at] = material.metallic, material.roughness
-        read = partial(_read, scene, material, face=hits.face[at], weights=hits.weights[:, at])
+        face, weights = hits.face[at], hits.weights[:, at]
         if material.texture is not None:
-            factor = factor * read("texture")
+            factor = factor * _sample(scene, material, "texture", face, weights)
         if material.metallic_roughness is not None:
-            both = read("metallic_roughness")
-            roughness[at] *= both[:, 1]
-            metallic[at] *= both[:, 2]
+            sampled = _sample(scene, material, "metallic_roughness", face, weights)
+            roughness[at] *= sampled[:, 1]
+            metallic[at] *= sampled[:, 2]
         color[at] *= factor
     return color, metallic, roughness
 
 
 def _sampler(material: Material, name: str) -> Sampler:
+    """The sampler of the material's texture of that name."""
     return material.samplers.get(name, Sampler())
 
 
 def _uv(scene: Scene, sampler: Sampler) -> Float[np.ndarray, "face 3 2"]:
-    if sampler.second_uv and scene.second_uv is not None:
+    """The set of texture coordinates that a sampler asks for."""
+    if sampler.use_second_uv and scene.second_uv is not None:
         return scene.second_uv
     return scene.uv
 
@@ -229,14 +240,14 @@ def _uv(scene: Scene, sampler: Sampler) -> Float[np.ndarray, "face 3 2"]:
 def _coordinates(
     sampler: Sampler, uv: Float[np.ndarray, "*point 2"]
 ) -> Float[np.ndarray, "*point 2"]:
-    """Where the texture is read for texture coordinates of the scene."""
-    turn = np.asarray(sampler.transform, uv.dtype)
-    if np.array_equal(turn, np.eye(2, 3)):
+    """The scene's texture coordinates after the sampler's transform."""
+    transform = np.asarray(sampler.transform, uv.dtype)
+    if np.array_equal(transform, np.eye(2, 3)):
         return uv
-    return uv @ turn[:, :2].T + turn[:, 2]
+    return uv @ transform[:, :2].T + transform[:, 2]
 
 
-def _read(
+def _sample(
     scene: Scene,
     material: Material,
     name: str,
@@ -247,7 +258,7 @@ def _read(
     sampler = _sampler(material, name)
     uv = _coordinates(sampler, _interpolate(_uv(scene, sampler), face, weights).T)
     texture = getattr(material, name)
-    return read_texture(texture, uv, srgb=name == "texture", sampler=sampler)
+    return sample_texture(texture, uv, srgb=name == "texture", sampler=sampler)
 
 
 def _interpolate(
@@ -255,17 +266,19 @@ def _interpolate(
     face: Int[np.ndarray, " hit"],
     weights: Float[np.ndarray, "3 hit"],
 ) -> Float[np.ndarray, "value hit"]:
-    """The corners' values at the hits, in float32."""
+    """Values given at the faces' corners, interpolated at the hits, in float32."""
     return np.einsum("in,nik->kn", weights.astype(np.float32), corners.take(face, axis=0))
 
 
 def _dot(a: Sequence[Any] | np.ndarray, b: Sequence[Any] | np.ndarray) -> np.ndarray:
+    """Dot products along the first axis, of length 3."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(
     a: Float[np.ndarray, "3 hit"], b: Float[np.ndarray, "3 hit"]
 ) -> Float[np.ndarray, "3 hit"]:
+    """Cross products along the first axis."""
     return np.stack(
         [
             a[1] * b[2] - a[2] * b[1],
@@ -276,4 +289,5 @@ def _cross(
 
 
 def _unit(vector: Float[np.ndarray, "3 hit"]) -> Float[np.ndarray, "3 hit"]:
+    """Vectors along the first axis, divided by their length."""
     return vector / np.sqrt(_dot(vector, vector))

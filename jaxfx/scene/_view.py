@@ -1,4 +1,4 @@
-"""Cameras on the host: in float64 NumPy, and the ones a scene is seen with by default."""
+"""A camera in float64 NumPy, as the renderers of this package use it on the host."""
 
 import functools
 from typing import Any, NamedTuple
@@ -10,13 +10,11 @@ from jaxtyping import Float
 from jaxfx._arguments import check_camera
 from jaxfx._checks import is_concrete, whole_number
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.light import AmbientLight, DirectionalLight
-from jaxfx.scene._scene import Scene
+from jaxfx.camera import Camera, PinholeCamera
 
 
 def check_size(caller: str, *sides: Any) -> list[int]:
-    """Height and width as integers; `ValueError` names `caller` for any other."""
+    """Height and width as positive integers; `ValueError` names `caller` otherwise."""
     return [
         whole_number(f"scene.{caller}({name}=...)", side)
         for name, side in zip(("height", "width"), sides, strict=True)
@@ -24,10 +22,10 @@ def check_size(caller: str, *sides: Any) -> list[int]:
 
 
 class View(NamedTuple):
-    """A camera in float64: what the backends and the surface lookup share.
+    """A camera in float64, for the backends and for the computation of hits.
 
-    A camera-space point (X, Y, Z) has the pixel of `intrinsics` @ (X, Y, Z), divided by its
-    last entry, in perspective; and that of `intrinsics` @ (X, Y, 1) otherwise.
+    With `perspective`, a camera-space point (X, Y, Z) has the homogeneous pixel coordinates
+    `intrinsics @ (X, Y, Z)`; without it, `intrinsics @ (X, Y, 1)`.
     """
 
     intrinsics: Float[np.ndarray, "3 3"]
@@ -35,8 +33,8 @@ class View(NamedTuple):
     perspective: bool
 
     @classmethod
-    def of(cls, camera: PinholeCamera | OrthographicCamera, caller: str) -> "View":
-        """The camera's numbers; `ValueError` names `caller` where they can't be used."""
+    def of(cls, camera: Camera, caller: str) -> "View":
+        """The view of a camera; `ValueError` names `caller` for a traced or degenerate one."""
         name = f"{caller}(camera)"
         check_camera(name, camera)
         if not is_concrete(camera):
@@ -50,14 +48,14 @@ class View(NamedTuple):
         else:
             intrinsics = np.eye(3)
             intrinsics[[0, 1], [0, 1]] = float(camera.pixels_per_unit)
-            intrinsics[:2, 2] = np.asarray(camera.centre)
+            intrinsics[:2, 2] = np.asarray(camera.center)
         view = cls(intrinsics, np.asarray(camera.world_from_camera, np.float64), perspective)
         if not (
             np.isfinite(view.intrinsics).all() and np.isfinite(view.world_from_camera).all()
         ):
-            raise ValueError(f"`{name}` must be finite, got a camera with other values.")
+            raise ValueError(f"`{name}` must be finite, got NaN or infinite values.")
         if np.linalg.det(intrinsics) == 0:
-            raise ValueError(f"`{name}` must have intrinsics with an inverse, got none.")
+            raise ValueError(f"`{name}` must have invertible intrinsics, got singular ones.")
         return view
 
     def rays(
@@ -65,90 +63,34 @@ class View(NamedTuple):
     ) -> tuple[Float[np.ndarray, "3 pixel"], Float[np.ndarray, "3 pixel"]]:
         """Origins and directions through the pixels' centres, row by row, in camera space.
 
-        A direction's z is 1, so that a ray's parameter is depth.
+        The z of a direction is 1, so that the parameter along a ray is depth.
         """
-        plane = np.linalg.inv(self.intrinsics) @ _homogeneous_centers(height, width)
-        plane[2] = 1
+        at_depth_1 = np.linalg.inv(self.intrinsics) @ _homogeneous_centers(height, width)
+        at_depth_1[2] = 1
         if self.perspective:
-            return np.zeros_like(plane), plane
-        origins = plane.copy()
+            return np.zeros_like(at_depth_1), at_depth_1
+        origins, directions = at_depth_1.copy(), at_depth_1
         origins[2] = 0
-        plane[:2] = 0
-        return origins, plane
+        directions[:2] = 0
+        return origins, directions
 
     def to_camera(self, points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "3 point"]:
-        """World points in camera space."""
+        """World points, in camera space."""
         rotation, eye = self.world_from_camera[:3, :3], self.world_from_camera[:3, 3]
         return rotation.T @ (points - eye).T
 
     def to_world(self, points: Float[np.ndarray, "3 point"]) -> Float[np.ndarray, "3 point"]:
-        """Camera-space points in world space."""
+        """Camera-space points, in world space."""
         return self.turn(points) + self.world_from_camera[:3, 3:]
 
     def turn(self, directions: Float[np.ndarray, "3 point"]) -> Float[np.ndarray, "3 point"]:
-        """Camera-space directions in world space."""
+        """Camera-space directions, in world space."""
         return self.world_from_camera[:3, :3] @ directions
 
 
 @functools.lru_cache(maxsize=4)
 def _homogeneous_centers(height: int, width: int) -> Float[np.ndarray, "3 pixel"]:
-    with jax.ensure_compile_time_eval():  # a trace may be under way around us
+    """The pixels' centres (x, y, 1), row by row; kept for the latest image sizes."""
+    with jax.ensure_compile_time_eval():  # The caller may be inside a trace.
         centers = np.asarray(pixel_centers(height, width), np.float64).reshape(-1, 2)
     return np.stack([centers[:, 0], centers[:, 1], np.ones(height * width)])
-
-
-def default_camera(scene: Scene, *, height: int, width: int) -> PinholeCamera:
-    """A camera that has the whole scene in its picture, seen from the front and above.
-
-    It looks at the middle of the bounding box, from as near as the scene and a margin allow,
-    with y up. A scene with a `viewpoint` of its own is seen from there.
-
-    **Arguments:**
-
-    - `scene`: from `load`, `from_trimesh` or `still_life`.
-    - `height`, `width`: image size in pixels.
-
-    **Returns:** a `PinholeCamera`.
-
-    **Raises:** `ValueError` for a size that is not a positive integer.
-
-    **Gradient:** none: this runs on the host.
-    """
-    height, width = check_size("default_camera", height, width)
-    tangents = np.array([width, height]) / min(height, width)
-    if scene.viewpoint is not None:
-        eye, target, fov = scene.viewpoint
-    else:
-        target, fov = scene.centre, np.radians(35)
-        backward = np.array([0.55, 0.4, 1.0]) / np.linalg.norm([0.55, 0.4, 1.0])
-        right = np.cross([0, 1, 0], backward)
-        right /= np.linalg.norm(right)
-        points = (scene.points - target).T
-        across = np.abs(np.stack([right, np.cross(backward, right)]) @ points)
-        reach = 0.9 * np.tan(fov / 2) * tangents[:, None]
-        eye = target + backward * np.max(
-            np.maximum(across / reach, scene.scale / 2) + backward @ points
-        )
-    fov_y = 2 * np.arctan(np.tan(fov / 2) * tangents[1])
-    return PinholeCamera.look_at(
-        eye, target, up=[0, 1, 0], fov_y=fov_y, height=height, width=width
-    )
-
-
-def default_lights(
-    camera: PinholeCamera | OrthographicCamera,
-) -> tuple[DirectionalLight, DirectionalLight, AmbientLight]:
-    """A warm key light over the camera's left shoulder, a cool fill light, and a little more.
-
-    **Arguments:** `camera`: the camera whose axes the lights follow.
-
-    **Returns:** key, fill and ambient light.
-
-    **Raises:** `ValueError` for another type.
-
-    **Gradient:** none: this runs on the host.
-    """
-    turn = View.of(camera, "scene.default_lights").world_from_camera[:3, :3]
-    key = DirectionalLight(turn @ [0.5, 0.7, 0.8], [0.85, 0.8, 0.72])
-    fill = DirectionalLight(turn @ [-0.8, 0.2, 0.6], [0.18, 0.2, 0.25])
-    return key, fill, AmbientLight([0.12, 0.12, 0.13])

@@ -21,7 +21,7 @@ def test_a_plane_looks_the_same_at_any_depth():
     [
         ((np.nan, [0, 0]), "pixels_per_unit", "must be positive, got nan"),
         ((np.inf, [0, 0]), "pixels_per_unit", "must be positive, got inf"),
-        ((1.0, [0, np.nan]), "centre", "must be finite, got"),
+        ((1.0, [0, np.nan]), "center", "must be finite, got"),
     ],
 )
 def test_ranges(fields, name, message):

@@ -91,7 +91,7 @@ def test_orthographic_project_in_homogeneous_coordinates(rng):
     pixels, depth = camera.project(points)
     for point, pixel, z in zip(points, pixels, depth, strict=True):
         local = np.linalg.inv(camera.world_from_camera) @ np.append(point, 1)
-        expected = local[:2] * camera.pixels_per_unit + camera.centre
+        expected = local[:2] * camera.pixels_per_unit + camera.center
         np.testing.assert_allclose(pixel, expected, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(z, local[2], rtol=1e-12, atol=1e-12)
 
@@ -391,8 +391,8 @@ def test_fields_are_strongly_typed():
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(single))
 
 
-def look_at(eye=(0.0, 0, 0), target=(0.0, 0, 1), up=(0.0, 1, 0), fov_y=1.0):
-    return PinholeCamera.look_at(eye, target, up=up, fov_y=fov_y, height=2, width=2)
+def look_at(eye=(0.0, 0, 0), at=(0.0, 0, 1), up=(0.0, 1, 0), fov_y=1.0):
+    return PinholeCamera.look_at(eye, at, up=up, fov_y=fov_y, height=2, width=2)
 
 
 def bad_lens(offset=(0.0, 0), distance=1.0):
@@ -410,7 +410,7 @@ def bad_lens(offset=(0.0, 0), distance=1.0):
         (lambda: PinholeCamera(np.eye(3), np.eye(3)), r"`PinholeCamera\(world_from_camera\)`"),
         (lambda: look_at(fov_y=0), r"`from_fov\(fov_y\)` must be in \(0, pi\) radians, got 0"),
         (lambda: look_at(fov_y=np.pi), r"`from_fov\(fov_y\)` must be in"),
-        (lambda: look_at(target=(0.0, 0, 0)), r"`look_at\(target\)` must be away from `eye`"),
+        (lambda: look_at(at=(0.0, 0, 0)), r"`look_at\(at\)` must be away from `eye`"),
         (lambda: look_at(up=(0.0, 0, 3)), r"`look_at\(up=...\)` must be off the direction"),
         (lambda: look_at(eye=(0.0, 0)), r"`look_at\(eye\)` must have shape \(3,\), got \(2,\)"),
         (
@@ -425,7 +425,7 @@ def bad_lens(offset=(0.0, 0), distance=1.0):
             lambda: OrthographicCamera(0, (0, 0), np.eye(4)),
             r"`OrthographicCamera\(pixels_per_unit\)` must be positive, got 0",
         ),
-        (lambda: OrthographicCamera(1, 0, np.eye(4)), r"`OrthographicCamera\(centre\)` must"),
+        (lambda: OrthographicCamera(1, 0, np.eye(4)), r"`OrthographicCamera\(center\)` must"),
         (
             lambda: OrthographicCamera(1, (0, 0), np.eye(4)[:3]),
             r"`OrthographicCamera\(world_from_camera\)` must have shape \(4, 4\)",

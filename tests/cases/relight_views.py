@@ -114,7 +114,7 @@ DEGENERATE: dict[str, tuple[GBuffer, Any]] = {
 # Views of the still life.
 
 MESH = scene.still_life()
-CENTRE = np.array(MESH.viewpoint.target)
+CENTRE = np.array(MESH.viewpoint.at)
 EYE = np.array(MESH.viewpoint.eye)
 
 

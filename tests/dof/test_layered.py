@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfx import FocusPlanes, ThinLens, dof, metrics, relight, scene
-from jaxfx.scene import _embree, _opengl
+from jaxfx.scene import embree, opengl
 
 
 # A lens for which the depths 1, 2 and inf are of defocus -12, 0 and 12 pixels.
@@ -216,7 +216,7 @@ def still_life():
 
     def buffer(camera, layer=0, backend="auto"):
         return scene.gbuffer(
-            mesh, camera, height=side, width=side, layer=layer, backend=backend
+            mesh, camera, height=side, width=side, layer_index=layer, backend=backend
         )
 
     def passes(aperture, samples):
@@ -255,7 +255,7 @@ def test_one_layer_is_better_than_scatter_on_the_still_life(still_life, scatter_
 @pytest.mark.parametrize("backend", ["embree", "opengl"])
 @pytest.mark.full
 def test_two_layers_are_better_by_far(still_life, scatter_score, backend):
-    problem = {"embree": _embree, "opengl": _opengl}[backend].problem()
+    problem = {"embree": embree, "opengl": opengl}[backend].problem()
     if problem:
         pytest.skip(f"the second layer can't be drawn here by {backend}: {problem}")
     behind = still_life[2](backend)

@@ -195,15 +195,15 @@ def test_a_missing_pass_is_named(tmp_path, name):
     layers = layers_of(gbuffer())
     del layers[name]
     exr.write(tmp_path / "a.exr", layers)
-    with pytest.raises(ValueError, match=rf"a.exr` must have the pass `{name}`, got \["):
+    with pytest.raises(ValueError, match=rf"a.exr` must have the layer `{name}`, got \["):
         exr.read_gbuffer(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize(
     ("name", "layer", "message"),
     [
-        ("shader", np.full((5, 7), 0.5), "must have whole numbers in the pass `shader`"),
-        ("shader", np.full((5, 7), np.nan), "must have whole numbers in the pass `shader`"),
+        ("shader", np.full((5, 7), 0.5), "must have whole numbers in the layer `shader`"),
+        ("shader", np.full((5, 7), np.nan), "must have whole numbers in the layer `shader`"),
         ("shader", np.zeros((5, 7, 3)), r"`GBuffer\(shader\)` must hold integers of shape"),
         ("depth", np.ones((5, 7, 1)), r"`GBuffer\(depth\)` must have shape \(5, 7\)"),
         ("color", np.ones((5, 7)), r"`GBuffer\(color\)` must have shape"),

@@ -62,7 +62,7 @@ def test_a_profile_that_is_not_heeded_is_logged(tmp_path, caplog, kind):
         Image.fromarray(codes()).save(tmp_path / "a", kind, icc_profile=profile)
         io.read_color(tmp_path / "a")
         assert len(caplog.records) == count
-    assert "a colour profile that is not heeded" in caplog.text
+    assert "a colour profile that is not applied" in caplog.text
 
 
 def test_png_and_exr_under_any_name(tmp_path):

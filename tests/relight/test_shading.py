@@ -85,7 +85,7 @@ def loop(gbuffer, camera, light):
             position = pose[:3, :3] @ (ray * depth[j, i]) + pose[:3, 3]
             to_camera = unit(pose[:3, 3] - position)
         else:
-            plane = [i + 0.5, j + 0.5] - number(camera.centre)
+            plane = [i + 0.5, j + 0.5] - number(camera.center)
             local = [*(plane / number(camera.pixels_per_unit)), depth[j, i]]
             position = pose[:3, :3] @ local + pose[:3, 3]
             to_camera = unit(-pose[:3, 2])

@@ -60,7 +60,7 @@ def test_a_bounce_is_the_path_tracers_but_for_the_noise_of_both():
     mesh = scene.still_life()
     camera = scene.default_camera(mesh, height=size[0], width=size[1])
     gbuffer, light = truth.lambert(mesh, camera, size), truth.LIGHTS["directional"]
-    transfer = scene.transfer(mesh, gbuffer, camera, points=512, rank=64)
+    transfer = scene.transfer(mesh, gbuffer, camera, point_count=512, rank=64)
     lit = truth.unshadowed(mesh, np.asarray(transfer.position, float), light)
     image = np.asarray(relight.indirect(gbuffer, transfer, [light], lit=[lit]))
     expected, noise = truth.bounced(mesh, camera, light, size, 128)

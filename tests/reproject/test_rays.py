@@ -14,7 +14,7 @@ POSE = camera(at=(0.7, 0.2, -0.4), turn=0.3).world_from_camera
 TARGETS = {
     "pinhole": camera(at=(0.7, 0.2, -0.4), turn=0.3),
     "orthographic": OrthographicCamera(
-        pixels_per_unit=8.0, centre=[15.0, 11.0], world_from_camera=POSE
+        pixels_per_unit=8.0, center=[15.0, 11.0], world_from_camera=POSE
     ),
 }
 

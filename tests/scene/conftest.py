@@ -11,11 +11,11 @@ import trimesh
 from PIL import Image
 
 from jaxfx import OrthographicCamera, PinholeCamera, io, scene
-from jaxfx.scene import _embree, _opengl
+from jaxfx.scene import embree, opengl
 
 
 def _require(name):
-    problem = {"embree": _embree, "opengl": _opengl}[name].problem()
+    problem = {"embree": embree, "opengl": opengl}[name].problem()
     if problem:
         pytest.skip(f"{name} does not work here: {problem}")
     return name
@@ -69,7 +69,7 @@ def rays():
             near = np.stack([zero, zero, zero], axis=-1)
             ahead = np.stack([(x - cx - skew * v) / fx, v, one], axis=-1)
         else:
-            local = np.stack([x, y], axis=-1) - np.asarray(camera.centre)
+            local = np.stack([x, y], axis=-1) - np.asarray(camera.center)
             local = local / float(camera.pixels_per_unit)
             near = np.concatenate([local, zero[..., None]], axis=-1)
             ahead = np.stack([zero, zero, one], axis=-1)

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from jaxfx import scene
-from jaxfx.scene import _embree
+from jaxfx.scene import embree
 
 
 def test_no_ray_slips_between_faces(camera, backend, rays):
@@ -31,6 +31,6 @@ def test_rays_at_edges():
     ball = trimesh.creation.icosphere(5)
     ball.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
     middles = ball.vertices[ball.edges_unique].mean(axis=1)
-    embree = _embree._accelerated(scene.from_trimesh(ball))
-    faces = embree.run(np.zeros(middles.shape, np.float32), middles.astype(np.float32))
+    built = embree.accelerated(scene.from_trimesh(ball))
+    faces = built.run(np.zeros(middles.shape, np.float32), middles.astype(np.float32))
     assert np.mean(faces >= 0) > 0.98

@@ -201,7 +201,12 @@ def test_node_transforms(tmp_path, straight, mirror):
         screen, transform=trimesh.transformations.translation_matrix([0, 0, 1])
     )
     hidden = scene.depth(
-        scene.from_trimesh(content), straight(2), height=2, width=3, backend="embree", layer=1
+        scene.from_trimesh(content),
+        straight(2),
+        height=2,
+        width=3,
+        backend="embree",
+        layer_index=1,
     )
     np.testing.assert_allclose(hidden, 5, rtol=1e-6)
 

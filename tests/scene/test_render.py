@@ -30,9 +30,9 @@ def test_layers_of_a_box_skip_its_inside(straight, backend):
     boxes = scene.from_trimesh(content)
     options = {"height": 4, "width": 4, "backend": backend}
     for layer, depth in [(0, 2), (1, 6), (2, np.inf), (5, np.inf)]:
-        buffer = scene.gbuffer(boxes, straight(4), **options, layer=layer)
+        buffer = scene.gbuffer(boxes, straight(4), **options, layer_index=layer)
         np.testing.assert_allclose(buffer.depth, depth)
-        ids = scene.object_ids(boxes, straight(4), **options, layer=layer)
+        ids = scene.object_ids(boxes, straight(4), **options, layer_index=layer)
         np.testing.assert_array_equal(ids, -1 if layer > 1 else layer)
 
 
@@ -45,7 +45,7 @@ def test_a_floor_seen_edge_on_does_not_show_behind_itself(backend, tilt):
     size = {"height": 61, "width": 83}
     eye, target, up = turn @ [0.3, 20 * tilt, 3], turn @ [0.1, 0, -17], turn[:, 1]
     camera = PinholeCamera.look_at(eye, target, up=up, fov_y=tilt, **size)
-    depth = [scene.depth(floor, camera, **size, backend=backend, layer=n) for n in (0, 1)]
+    depth = [scene.depth(floor, camera, **size, backend=backend, layer_index=n) for n in (0, 1)]
     assert np.isfinite(depth[0]).all()
     assert np.isinf(depth[1]).all()
 
@@ -81,8 +81,8 @@ def test_bad_arguments(name, ball, view):
             call(ball, view, **size)
     with pytest.raises(ValueError, match=rf"scene\.{name}\(backend=\.\.\.\).*'vulkan'"):
         call(ball, view, **SIZE, backend="vulkan")
-    with pytest.raises(ValueError, match=rf"scene\.{name}\(layer=\.\.\.\).*-1"):
-        call(ball, view, **SIZE, layer=-1)
+    with pytest.raises(ValueError, match=rf"scene\.{name}\(layer_index=\.\.\.\).*-1"):
+        call(ball, view, **SIZE, layer_index=-1)
 
 
 def test_bad_scenes_and_cameras(ball, view, monkeypatch):
@@ -98,7 +98,7 @@ def test_bad_scenes_and_cameras(ball, view, monkeypatch):
     with pytest.raises(ValueError, match="must be finite"):
         scene.depth(ball, broken, **SIZE)
     flat = changed(0.0)
-    with pytest.raises(ValueError, match="an inverse"):
+    with pytest.raises(ValueError, match="invertible"):
         scene.depth(ball, flat, **SIZE)
     with pytest.raises(ValueError, match="must be concrete, got a traced camera"):
         jax.jit(lambda c: scene.depth(ball, c, **SIZE))(view)
@@ -119,4 +119,4 @@ def test_a_place_that_is_rounded_is_said(backend, caplog):
     assert not caplog.records
     draw(PinholeCamera(focal.astype(np.float32), pose.astype(np.float32)))
     (record,) = caplog.records
-    assert "the camera's place is rounded to 0.12 in float32" in record.getMessage()
+    assert "the camera's position is rounded to 0.12 in float32" in record.getMessage()

@@ -44,9 +44,9 @@ def test_bounding_box_is_of_the_triangles():
     vertices = np.concatenate([np.diag([2.0, 4.0, 6.0]), [[99.0, 99.0, 99.0]]])
     one = scene.Scene(**arrays(vertices=vertices))
     np.testing.assert_allclose(one.bounds, [[0, 0, 0], [2, 4, 6]])
-    np.testing.assert_allclose(one.centre, [1, 2, 3])
+    np.testing.assert_allclose(one.center, [1, 2, 3])
     np.testing.assert_allclose(one.extent, [2, 4, 6])
-    assert one.scale == pytest.approx(np.sqrt(14))
+    assert one.radius == pytest.approx(np.sqrt(14))
     assert repr(one) == "Scene(1 triangles, 1 objects, 2 x 4 x 6)"
 
 
@@ -63,7 +63,7 @@ def test_bounding_box_is_of_the_triangles():
         (
             {
                 "materials": (
-                    scene.Material(samplers={"texture": scene.Sampler(second_uv=True)}),
+                    scene.Material(samplers={"texture": scene.Sampler(use_second_uv=True)}),
                 )
             },
             r"Scene\(second_uv=...\)` must be given",

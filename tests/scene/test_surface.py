@@ -125,7 +125,7 @@ def test_second_layer_against_a_loop_over_all_triangles(camera, backend, rays):
     behind = np.where(back | (depths <= first * (1 + 1e-9)), np.inf, depths)
     for layer in (1, 2):
         expected = behind.min(axis=-1)
-        depth = scene.depth(cluttered, camera, **half, backend=backend, layer=layer)
+        depth = scene.depth(cluttered, camera, **half, backend=backend, layer_index=layer)
         agree = np.isclose(depth, expected, rtol=1e-5) | (np.isinf(depth) & np.isinf(expected))
         assert agree.mean() > 0.995
         assert np.isfinite(expected).mean() > 0.05

@@ -11,7 +11,7 @@ from jaxfx import OrthographicCamera, PinholeCamera, scene
 
 
 pytestmark = pytest.mark.skipif(
-    scene._embree.problem() is not None, reason="Embree does not work on this machine."
+    scene.embree.problem() is not None, reason="Embree does not work on this machine."
 )
 
 
@@ -42,7 +42,7 @@ def ball():
     inside = creation.icosphere(3, radius=2.0)
     inside.invert()
     camera = PinholeCamera.from_fov(1.5, height=12, width=12)
-    return built([inside], camera, points=400, rank=400)[2]
+    return built([inside], camera, point_count=400, rank=400)[2]
 
 
 @pytest.mark.full
@@ -71,16 +71,18 @@ def test_singular_vectors_are_orthonormal_and_the_largest_come_first(ball):
 def test_parallel_squares_have_their_form_factor():
     """0.19982 at a distance of one side (Hottel 1931); from the one side only."""
     send, get = square(0, 1), square(1, -1)
-    transfer = built([send, get], middle(), points=256, rank=64)[2]
+    transfer = built([send, get], middle(), point_count=256, rank=64)[2]
     share = np.asarray(transfer.receive) @ np.asarray(transfer.send).sum(axis=1)
     assert share.mean() == pytest.approx(0.19982, rel=0.01)
-    turned = built([square(0, -1), get], middle(), points=16, rank=16)[2]
+    turned = built([square(0, -1), get], middle(), point_count=16, rank=16)[2]
     np.testing.assert_array_equal(turned.receive, 0)
 
 
 def test_a_wall_between_lets_nothing_through():
     wall = square(0.25, 1, side=3.0)
-    mesh, _, transfer = built([square(0, 1), square(1, -1), wall], middle(), points=64, rank=8)
+    mesh, _, transfer = built(
+        [square(0, 1), square(1, -1), wall], middle(), point_count=64, rank=8
+    )
     behind = np.asarray(transfer.position)[:, 2] < 0.1
     np.testing.assert_allclose(np.asarray(transfer.send)[:, behind], 0, atol=1e-6)
     assert np.asarray(transfer.receive).any()
@@ -90,7 +92,9 @@ def test_a_wall_between_lets_nothing_through():
 
 
 def test_points_have_the_reflectance_and_the_front_of_what_they_lie_on():
-    mesh, gbuffer, transfer = built([square(0, 1), square(1, -1)], middle(), points=32, rank=4)
+    mesh, gbuffer, transfer = built(
+        [square(0, 1), square(1, -1)], middle(), point_count=32, rank=4
+    )
     assert transfer.receive.shape == (12, 12, 4) and transfer.send.shape == (4, 32)
     assert transfer.receive.dtype == jnp.float32
     z = np.asarray(transfer.position)[:, 2]
@@ -99,17 +103,23 @@ def test_points_have_the_reflectance_and_the_front_of_what_they_lie_on():
         np.asarray(transfer.diffuse) - np.asarray(gbuffer.diffuse[0, 0]), 0, atol=1e-6
     )
     assert np.abs(np.asarray(transfer.position)[:, :2]).max() <= 0.5
-    again = scene.transfer(mesh, gbuffer, middle(), points=32, rank=4)
+    again = scene.transfer(mesh, gbuffer, middle(), point_count=32, rank=4)
     np.testing.assert_array_equal(transfer.position, again.position)
 
 
 def test_errors_name_the_argument():
     transfer, visible = inspect.unwrap(scene.transfer), inspect.unwrap(scene.visible)
-    mesh, gbuffer, _ = built([square(1, -1)], middle(), points=2, rank=1)
+    mesh, gbuffer, _ = built([square(1, -1)], middle(), point_count=2, rank=1)
     for options, message in (
-        ({"points": 0}, r"`scene.transfer\(points=...\)` must be at least 1, got 0"),
-        ({"points": 2.0}, r"`scene.transfer\(points=...\)` must be an integer, got 2.0"),
-        ({"points": 4, "rank": 5}, r"`scene.transfer\(rank=...\)` must be in \[1, 4\], got 5"),
+        ({"point_count": 0}, r"`scene.transfer\(point_count=...\)` must be at least 1, got 0"),
+        (
+            {"point_count": 2.0},
+            r"`scene.transfer\(point_count=...\)` must be an integer, got 2.0",
+        ),
+        (
+            {"point_count": 4, "rank": 5},
+            r"`scene.transfer\(rank=...\)` must be in \[1, 4\], got 5",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             transfer(mesh, gbuffer, middle(), **options)

@@ -25,7 +25,7 @@ def test_default_camera_frames_any_mesh():
             assert (np.asarray(inset) > 0.04 * min(height, width)).all()
             reach = np.ptp(np.asarray(pixels), axis=0) / [width, height]
             assert reach.max() > 0.3
-            middle, _ = camera.project(jnp.asarray(box.centre))
+            middle, _ = camera.project(jnp.asarray(box.center))
             np.testing.assert_allclose(middle, [width / 2, height / 2], atol=1e-6)
 
 

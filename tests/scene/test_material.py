@@ -1,11 +1,11 @@
-"""The sRGB curve and the reads of byte textures, against their definitions."""
+"""The sRGB curve and the samples of byte textures, against their definitions."""
 
 import numpy as np
 import pytest
 
 from jaxfx.io import linear_from_srgb
 from jaxfx.scene import Sampler
-from jaxfx.scene._color import read_texture, table
+from jaxfx.scene._material import sample_texture, table
 
 
 def test_srgb_curve():
@@ -53,10 +53,10 @@ def test_reads_against_a_loop(shape, wrap, dtype):
                 total += (1 - abs(x - i)) * (1 - abs(y - j)) * texel(i, j)
         return total
 
-    found = read_texture(texture, uv, srgb=True, sampler=Sampler(wrap))
+    found = sample_texture(texture, uv, srgb=True, sampler=Sampler(wrap))
     expected = [read(float(u), float(v)) for u, v in uv]
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    near = read_texture(texture, uv, srgb=True, sampler=Sampler(wrap, nearest=True))
+    near = sample_texture(texture, uv, srgb=True, sampler=Sampler(wrap, nearest=True))
     at = np.floor(np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], -1)).astype(int)
     np.testing.assert_allclose(near, [texel(*place) for place in at.tolist()], atol=1e-6)
 
@@ -65,5 +65,5 @@ def test_coordinates_far_away_stay_in_the_image():
     texture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     uv = np.array([[1e30, -1e30], [-3e7, 1e20]], np.float32)
     for wrap in ("repeat", "mirror", "clamp"):
-        found = read_texture(texture, uv, srgb=False, sampler=Sampler((wrap, wrap)))
+        found = sample_texture(texture, uv, srgb=False, sampler=Sampler((wrap, wrap)))
         assert ((found >= 0) & (found <= 11 / 255)).all()

@@ -240,7 +240,7 @@ def test_each_texture_has_its_own_coordinates(gltf, uv, texels, codes):
     camera = scene.default_camera(loaded, height=8, width=8)
     assert np.isfinite(scene.gbuffer(loaded, camera, height=8, width=8).roughness).all()
     sampler = loaded.materials[0].samplers["metallic_roughness"]
-    assert sampler.second_uv
+    assert sampler.use_second_uv
     np.testing.assert_allclose(loaded.second_uv[0], (mirrored * [1, -1] + [0, 1])[[0, 1, 2]])
 
 
@@ -410,7 +410,7 @@ BROKEN = {
     ),
     "two parents": (
         lambda d: d.update(nodes=[{"children": [2]}, {"children": [2]}, {"mesh": 0}]),
-        "node 2 is twice a child",
+        "node 2 is listed as a child twice",
     ),
     "no affine matrix": (lambda d: d.update(nodes=[{"mesh": 0, "matrix": [1] * 16}]), "affine"),
     "no unit rotation": (
@@ -439,7 +439,7 @@ BROKEN = {
     "an image that is not there": (lambda d: d["images"][0].update(uri="gone.png"), "gone.png"),
     "an image by an extension": (
         lambda d: d.update(textures=[{"extensions": {"KHR_texture_basisu": {"source": 0}}}]),
-        "KHR_texture_basisu alone",
+        "held by KHR_texture_basisu",
     ),
     "gloss alone": (
         lambda d: d.update(

@@ -11,23 +11,22 @@ from jaxtyping import Float
 
 from jaxfx.io import linear_from_srgb
 from jaxfx.scene._material import Material
-from jaxfx.scene._mtl import PLAIN
-from jaxfx.scene._part import Part, UnreadableError, unit
-from jaxfx.scene._polygons import triangulate
+from jaxfx.scene._part import UNASSIGNED, Part, UnreadableError, unit
+from jaxfx.scene.formats._polygons import triangulate
 
 
 _Words = list[str]
 
 
 def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
-    """The one part of an OFF file, and what of the file it leaves out."""
+    """The one part of an OFF file, and the names of what is left out."""
     text = data.decode("utf-8-sig")
     lines = [words for line in text.splitlines() if (words := line.split("#")[0].split())]
     head = re.fullmatch(r"(ST)?(C)?(N)?OFF(\d*)", lines[0][0]) if lines else None
     if head is None or "BINARY" in lines[0]:
         raise UnreadableError("it does not begin with OFF, COFF, NOFF or STOFF")
-    has_uv, has_color, has_normal = (bool(each) for each in head.groups()[:3])
-    lines[0] = [head[4], *lines[0][1:]] if head[4] else lines[0][1:]  # "OFF8 6 0", too
+    has_uv, has_color, has_normal = (prefix is not None for prefix in head.groups()[:3])
+    lines[0] = [head[4], *lines[0][1:]] if head[4] else lines[0][1:]  # "OFF8 6 0" is found too.
     lines = lines if lines[0] else lines[1:]
     count, face_count = (int(word) for word in lines[0][:2])
     rows, polygons = lines[1 : count + 1], lines[count + 1 : count + 1 + face_count]
@@ -37,22 +36,25 @@ def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
         raise UnreadableError(f"{len(lines) - count - 1 - face_count} lines are left over")
     if not polygons:
         return [], set()
-    places, widths = {}, {"position": 3, "normal": 3 * has_normal, "uv": 2 * has_uv}
+    widths = {"position": 3, "normal": 3 * has_normal, "uv": 2 * has_uv}
     widths["color"] = len(rows[0]) - sum(widths.values())
     if widths["color"] not in ((3, 4) if has_color else (0,)):
         raise UnreadableError(f"its vertices have {len(rows[0])} numbers")
-    at = 0
+    columns, start = {}, 0
     for name in ("position", "normal", "color", "uv"):
-        places[name] = [words[at : at + widths[name]] for words in rows]
-        at += widths[name]
+        columns[name] = [words[start : start + widths[name]] for words in rows]
+        start += widths[name]
     if any(len(words) != len(rows[0]) for words in rows):
         raise UnreadableError("its vertices do not all have the same number of numbers")
-    return _part(path.name, {name: each for name, each in places.items() if each[0]}, polygons)
+    return _part(
+        path.name, {name: column for name, column in columns.items() if column[0]}, polygons
+    )
 
 
 def _part(
     name: str, vertex: dict[str, list[_Words]], polygons: list[_Words]
 ) -> tuple[list[Part], set[str]]:
+    """The part of a file's vertex columns and polygon lines, and what is left out."""
     vertices = np.array(vertex["position"], np.float64)
     corners, sizes, tails = [], [], []
     for words in polygons:
@@ -63,11 +65,11 @@ def _part(
         corners += index
         sizes.append(size)
         tails.append(words[size + 1 :])
-    at, owner, crossing = triangulate(vertices[corners], sizes)
-    faces = np.array(corners)[at]
+    triangles, owner, crossing = triangulate(vertices[corners], sizes)
+    faces = np.array(corners)[triangles]
     ignored = {"indices of a colour map"} if any(len(tail) == 1 for tail in tails) else set()
     if crossing:
-        ignored.add(f"how {crossing} polygons that cross themselves are to be cut")
+        ignored.add(f"the triangulation of {crossing} polygons that intersect themselves")
     colors = None
     if "color" in vertex:
         colors = _colors(vertex["color"])[faces]
@@ -80,16 +82,16 @@ def _part(
         normals = unit(np.array(vertex["normal"], np.float64))[faces]
     if "uv" in vertex:
         uv = np.array(vertex["uv"], np.float64)[faces]
-    none = np.zeros(len(faces), np.intp)
-    material = PLAIN if colors is None else Material()
-    part = Part(vertices, faces, [material], none, [name], none, normals, uv, None, colors)
+    zeros = np.zeros(len(faces), np.intp)
+    material = UNASSIGNED if colors is None else Material()
+    part = Part(vertices, faces, [material], zeros, [name], zeros, normals, uv, None, colors)
     return [part], ignored
 
 
 def _colors(rows: list[_Words]) -> Float[np.ndarray, "row 3"]:
-    """Linear RGB: whole numbers are over 255, those with a point over 1."""
+    """Linear RGB of sRGB colours: integers are divided by 255, numbers with a point are not."""
     are_whole = all(word.isdigit() for row in rows for word in row)
     values = np.array([row[:3] for row in rows], np.float64) / (255 if are_whole else 1)
     if not ((values >= 0) & (values <= 1)).all():
-        raise UnreadableError("a colour is neither of whole numbers to 255 nor of shares to 1")
+        raise UnreadableError("a colour is neither of integers to 255 nor of numbers in [0, 1]")
     return linear_from_srgb(values)

@@ -208,8 +208,8 @@ def test_what_is_left_out_is_said_once(load, caplog):
         load(f"mtllib m.mtl\n{QUAD}l 1 2\np 1\n{FACE}f 1 3 2 4\n", mtl)
     (record,) = caplog.records
     assert record.getMessage().endswith(
-        "left out are d of materials, how 1 polygons that cross themselves are to be cut, "
-        "lines, map_Bump of materials, points"
+        "left out are d of materials, lines, map_Bump of materials, points, "
+        "the triangulation of 1 polygons that intersect themselves"
     )
 
 

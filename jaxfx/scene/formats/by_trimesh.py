@@ -1,4 +1,4 @@
-"""Meshes of trimesh as parts of a scene."""
+"""Files that trimesh reads, and its meshes in memory, as parts of a scene."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,28 +9,30 @@ from jaxtyping import Float, Int
 
 from jaxfx._extras import needs
 from jaxfx.io import linear_from_srgb
-from jaxfx.scene._images import pillow_codes
 from jaxfx.scene._material import Material
-from jaxfx.scene._mtl import PLAIN
-from jaxfx.scene._part import Part, UnreadableError, placed
+from jaxfx.scene._part import UNASSIGNED, Part, UnreadableError, placed
+from jaxfx.scene.formats._images import pillow_codes
 
 
 _ARCHIVES = (".zip", ".gz", ".bz2", ".xz", ".tar", ".tgz")
 
 
 def read(path: Path, data: bytes) -> tuple[list[Part], set[str]]:
-    """The parts of a file that trimesh reads."""
+    """The parts of a file that trimesh reads; trimesh does not say what it leaves out."""
     with needs("scene"):
         import trimesh
 
     if path.suffix.lower() in _ARCHIVES:
         raise UnreadableError("it is an archive: unpack it")
-    smooth = False if path.suffix.lower() == ".stl" else None  # which has no vertices' normals
+    smooth = False if path.suffix.lower() == ".stl" else None  # STL has no vertex normals.
     return list(parts(trimesh.load_scene(path, process=False), smooth=smooth)), set()
 
 
 def parts(content: Any, *, smooth: bool | None) -> Iterator[Part]:
-    """Every instance of a triangle mesh; points and curves are passed over."""
+    """The parts of a `trimesh.Scene`: every instance of a triangle mesh; no points or curves.
+
+    `smooth` is as in `scene.from_trimesh`.
+    """
     with needs("scene"):
         import trimesh
 
@@ -43,6 +45,7 @@ def parts(content: Any, *, smooth: bool | None) -> Iterator[Part]:
 
 
 def _part(name: str, mesh: Any, smooth: bool | None) -> Part:
+    """A mesh as one object, in its own space."""
     faces = np.asarray(mesh.faces)
     materials, index = _materials(mesh)
     return Part(
@@ -60,27 +63,28 @@ def _part(name: str, mesh: Any, smooth: bool | None) -> Part:
 
 
 def _normals(mesh: Any, smooth: bool | None) -> Float[np.ndarray, "face 3 3"] | None:
-    """The vertices' normals at the corners; with None, only those that were given to the mesh.
+    """The vertex normals at the corners, or None for flat faces.
 
-    trimesh keeps given normals and those it made itself in one place. Given ones are told by
-    not being what it makes of the same faces.
+    With `smooth` None they are used only if the mesh came with normals. trimesh stores those
+    and the ones that it computes itself in one place: normals that differ from what it computes
+    for the same faces are taken for the mesh's.
     """
     with needs("scene"):
         import trimesh
 
     if smooth is False:
         return None
-    normals = mesh.copy(
-        include_cache=True
-    ).vertex_normals  # asked of `mesh`, it would keep them
+    # Of a copy: `mesh` would keep the normals that it computes.
+    normals = mesh.copy(include_cache=True).vertex_normals
     if smooth is None:
-        made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
-        if np.allclose(normals, made, atol=1e-5, equal_nan=True):
+        computed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals
+        if np.allclose(normals, computed, atol=1e-5, equal_nan=True):
             return None
     return np.nan_to_num(normals)[mesh.faces]
 
 
 def _uv(mesh: Any) -> Float[np.ndarray, "face 3 2"] | None:
+    """The corners' texture coordinates, or None."""
     uv = getattr(mesh.visual, "uv", None)
     if uv is None or np.shape(uv)[0] != len(mesh.vertices):
         return None
@@ -88,11 +92,11 @@ def _uv(mesh: Any) -> Float[np.ndarray, "face 3 2"] | None:
     return uv[mesh.faces]
 
 
-def _kind(mesh: Any) -> str | None:
-    """Whether colours are of faces or of vertices.
+def _color_kind(mesh: Any) -> str | None:
+    """Whether a mesh has colours per "face" or per "vertex", or neither (None).
 
-    trimesh makes up colours where they are asked for, and takes them for the mesh's own once
-    one of them is changed; but only when they are asked for again.
+    trimesh hands out default colours, and regards them as the mesh's once a caller has changed
+    one; `kind` shows that only after the colours have been asked for again.
     """
     for name in ("face_colors", "vertex_colors"):
         getattr(mesh.visual, name, None)
@@ -100,7 +104,8 @@ def _kind(mesh: Any) -> str | None:
 
 
 def _colors(mesh: Any) -> Float[np.ndarray, "face 3 3"] | None:
-    kind = _kind(mesh)
+    """The corners' linear RGB, or None."""
+    kind = _color_kind(mesh)
     if kind == "face":
         colors = linear_from_srgb(_unit_rgb(mesh.visual.face_colors))
         return np.repeat(colors[:, None], 3, axis=1)
@@ -114,21 +119,22 @@ def _colors(mesh: Any) -> Float[np.ndarray, "face 3 3"] | None:
 
 
 def _require_bytes(mesh: Any) -> None:
-    """Refuse what is left of a PLY file's 16 bits, where it can be told."""
-    read = mesh.metadata.get("_ply_raw", {}).get("vertex", {})
-    kind = np.dtype(read.get("properties", {}).get("red", "u1"))
-    if kind.kind in "iu" and kind != np.uint8:
-        codes = np.ravel(read["data"]["red"]).astype(np.uint8)
+    """Refuse a PLY file's 16-bit colours, of which trimesh keeps the low bytes alone."""
+    vertex = mesh.metadata.get("_ply_raw", {}).get("vertex", {})
+    dtype = np.dtype(vertex.get("properties", {}).get("red", "u1"))
+    if dtype.kind in "iu" and dtype != np.uint8:
+        codes = np.ravel(vertex["data"]["red"]).astype(np.uint8)
         if np.array_equal(codes, mesh.visual.vertex_colors[:, 0]):
             raise UnreadableError(
-                f"trimesh has cut its colours of {kind} to bytes; `scene.load` reads the file"
+                f"trimesh has cut its colours of {dtype} to bytes; `scene.load` reads the file"
             )
 
 
 def _unit_rgb(colors: Any) -> Float[np.ndarray, "*any 3"]:
+    """RGB in [0, 1], without alpha: integers are divided by their type's largest."""
     colors = np.asarray(colors)
-    top = np.iinfo(colors.dtype).max if np.issubdtype(colors.dtype, np.integer) else 1
-    return colors[..., :3].astype(np.float64) / top
+    largest = np.iinfo(colors.dtype).max if np.issubdtype(colors.dtype, np.integer) else 1
+    return colors[..., :3].astype(np.float64) / largest
 
 
 def _materials(mesh: Any) -> tuple[list[Material], Int[np.ndarray, " face"]]:
@@ -139,15 +145,16 @@ def _materials(mesh: Any) -> tuple[list[Material], Int[np.ndarray, " face"]]:
     index = np.zeros(len(mesh.faces), np.int64)
     material = getattr(mesh.visual, "material", None)
     if material is None:
-        return [Material() if _kind(mesh) in ("face", "vertex") else PLAIN], index
+        return [Material() if _color_kind(mesh) in ("face", "vertex") else UNASSIGNED], index
     if not isinstance(material, MultiMaterial):
         return [_material(mesh, material)], index
-    found = [_material(mesh, each) for each in material.materials]
-    chosen = mesh.visual.face_materials
-    return found or [PLAIN], index if chosen is None else np.asarray(chosen, np.int64)
+    materials = [_material(mesh, m) for m in material.materials] or [UNASSIGNED]
+    of_face = mesh.visual.face_materials
+    return materials, index if of_face is None else np.asarray(of_face, np.int64)
 
 
 def _material(mesh: Any, material: Any) -> Material:
+    """One of trimesh's materials as ours."""
     with needs("scene"):
         from trimesh.visual.material import PBRMaterial
 
@@ -158,34 +165,36 @@ def _material(mesh: Any, material: Any) -> Material:
 
 
 def _pbr(material: Any, has_uv: bool) -> Material:
+    """A material in glTF's terms."""
     factor, metallic = material.baseColorFactor, material.metallicFactor
-    roughness, both = material.roughnessFactor, material.metallicRoughnessTexture
+    roughness, texture = material.roughnessFactor, material.metallicRoughnessTexture
     return Material(
         color=(1.0, 1.0, 1.0) if factor is None else tuple(_unit_rgb(factor).tolist()),
         texture=_image(material.baseColorTexture) if has_uv else None,
         metallic=1.0 if metallic is None else float(np.clip(metallic, 0, 1)),
         roughness=1.0 if roughness is None else float(np.clip(roughness, 0, 1)),
-        metallic_roughness=_image(both) if has_uv else None,
+        metallic_roughness=_image(texture) if has_uv else None,
         normal_map=_image(material.normalTexture) if has_uv else None,
     )
 
 
 def _simple(material: Any, has_uv: bool) -> Material:
+    """A material in Phong's terms. An exponent n becomes the roughness sqrt(2 / (n + 2))."""
     texture = _image(material.image) if has_uv else None
-    given = material.kwargs.get("kd")
-    if given is None and not _is_default(material.diffuse):
-        given = _unit_rgb(material.diffuse)
-    if given is not None:
-        color = tuple(linear_from_srgb(np.clip(np.asarray(given, float)[:3], 0, 1)).tolist())
+    diffuse = material.kwargs.get("kd")
+    if diffuse is None and not _is_default(material.diffuse):
+        diffuse = _unit_rgb(material.diffuse)
+    if diffuse is not None:
+        color = tuple(linear_from_srgb(np.clip(np.asarray(diffuse, float)[:3], 0, 1)).tolist())
     else:
-        color = PLAIN.color if texture is None else (1.0, 1.0, 1.0)
-    shines = not _is_default(material.specular) and np.any(material.specular[:3])
-    exponent = max(material.glossiness, 0.0) if shines else 0.0
+        color = UNASSIGNED.color if texture is None else (1.0, 1.0, 1.0)
+    has_highlight = not _is_default(material.specular) and np.any(material.specular[:3])
+    exponent = max(material.glossiness, 0.0) if has_highlight else 0.0
     return Material(color=color, texture=texture, roughness=(2 / (exponent + 2)) ** 0.5)
 
 
 def _is_default(color: Any) -> bool:
-    """Whether trimesh filled this in for a material that says nothing."""
+    """Whether a colour is the one that trimesh fills in for a material without one."""
     with needs("scene"):
         from trimesh.visual.color import DEFAULT_COLOR
 
@@ -193,4 +202,5 @@ def _is_default(color: Any) -> bool:
 
 
 def _image(image: Any) -> np.ndarray | None:
+    """A Pillow image as texels."""
     return None if image is None else pillow_codes(image, "of a material")

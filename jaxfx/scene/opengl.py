@@ -1,4 +1,4 @@
-"""Visibility by rasterisation, with OpenGL in the windowless context that pyrender opens."""
+"""Visible faces by rasterisation, with OpenGL in a windowless context of pyrender's."""
 
 import os
 import weakref
@@ -39,21 +39,23 @@ void main() {
 }
 """
 
-# A context belongs to a thread: this one alone speaks to OpenGL.
+# An OpenGL context belongs to one thread: all calls are made on this one.
 _thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="jaxfx.scene.opengl")
-_TILE = 4096  # pixels a side that are drawn at once; OpenGL's own limit may be less
+# Largest side of the framebuffer, in pixels; larger images are drawn in tiles. More takes more
+# memory; some drivers allow less, which is asked for.
+_TILE = 4096
 
 
 @cache
 def problem() -> str | None:
     """Why OpenGL can't be used here, or None where it can."""
-    ours = "PYOPENGL_PLATFORM" not in os.environ
-    if ours:
+    is_unset = "PYOPENGL_PLATFORM" not in os.environ
+    if is_unset:
         os.environ["PYOPENGL_PLATFORM"] = "egl"
     try:
         _thread.submit(_rasterizer).result()
-    except Exception as error:  # a missing library shows as almost any exception
-        if ours:
+    except Exception as error:  # A missing library shows as almost any exception.
+        if is_unset:
             del os.environ["PYOPENGL_PLATFORM"]
         return f"{type(error).__name__}: {error}"
     return None
@@ -62,27 +64,28 @@ def problem() -> str | None:
 def first_faces(
     scene: Scene, view: View, start: Float[np.ndarray, "height width"]
 ) -> Int[np.ndarray, "height width"]:
-    """The first face past the depth `start` at each pixel's centre; -1 where there is none."""
+    """The first face beyond the depth `start` at each pixel's centre; -1 for none."""
     faces = np.empty(start.shape, np.int32)
     side = _thread.submit(lambda: _rasterizer().side).result()
     for row in range(0, start.shape[0], side):
         for column in range(0, start.shape[1], side):
             tile = slice(row, row + side), slice(column, column + side)
-            moved = np.eye(3)
-            moved[:2, 2] = -column, -row
-            part = view._replace(intrinsics=moved @ view.intrinsics)
-            faces[tile] = _faces_of_tile(scene, part, start[tile])
+            shift = np.eye(3)
+            shift[:2, 2] = -column, -row
+            tile_view = view._replace(intrinsics=shift @ view.intrinsics)
+            faces[tile] = _faces_of_tile(scene, tile_view, start[tile])
     return faces
 
 
 def _faces_of_tile(
     scene: Scene, view: View, start: Float[np.ndarray, "height width"]
 ) -> Int[np.ndarray, "height width"]:
+    """As `first_faces`, for an image no larger than the framebuffer."""
     height, width = start.shape
     clip, depth, farthest = _transforms(scene, view, height, width)
     if farthest <= 0:
         return np.full((height, width), -1, np.int32)
-    unit_start = np.ascontiguousarray(start / scene.scale, np.float32)
+    unit_start = np.ascontiguousarray(start / scene.radius, np.float32)
     draw = lambda: _rasterizer().draw(scene, clip, depth, farthest, unit_start)
     return _thread.submit(draw).result()
 
@@ -90,34 +93,36 @@ def _faces_of_tile(
 def _transforms(
     scene: Scene, view: View, height: int, width: int
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4"], float]:
-    """From unit triangles to clip space and to depth, both in units of the scene's scale.
+    """The maps from unit triangles to clip space, 4x4, and to depth, 4; and the largest depth.
 
-    Then the largest depth in the scene. Clip space's y points down, as an image's does, so
-    that the framebuffer's first row is the top one. Its z is 0 in perspective: there is no near
-    plane but the eye, and the fragments' own depth decides what is in front.
+    Depths are in units of the scene's radius. The y of clip space points down, so that the
+    framebuffer's first row is the image's top. In perspective its z is 0: nothing is clipped
+    but what lies behind the eye, and the fragment shader computes the depth that is tested.
     """
     rotation, eye = view.world_from_camera[:3, :3], view.world_from_camera[:3, 3]
-    offset = rotation.T @ (scene.centre - eye) / scene.scale
+    offset = rotation.T @ (scene.center - eye) / scene.radius
     x, y, depth = np.column_stack([rotation.T, offset])
-    one = np.array([0.0, 0.0, 0.0, 1.0])
-    box = (scene.bounds - scene.centre) / scene.scale
+    constant = np.array([0.0, 0.0, 0.0, 1.0])
+    box = (scene.bounds - scene.center) / scene.radius
+    # A little beyond the box, so that rounding leaves its farthest corner below depth 1.
     farthest = 1.0001 * float(np.maximum(*(box * depth[:3])).sum() + depth[3])
     if view.perspective:
         w, z = depth, 0 * depth
         u, v, _ = view.intrinsics @ np.stack([x, y, depth])
     else:
-        w, z = one, 2 * depth / max(farthest, 1e-30) - one
-        u, v, _ = view.intrinsics @ np.stack([x * scene.scale, y * scene.scale, one])
+        w, z = constant, 2 * depth / max(farthest, 1e-30) - constant
+        u, v, _ = view.intrinsics @ np.stack([x * scene.radius, y * scene.radius, constant])
     return np.stack([2 / width * u - w, 2 / height * v - w, z, w]), depth, farthest
 
 
 @cache
 def _rasterizer() -> "_Rasterizer":
+    """The one rasteriser of the process; to be called on `_thread` only."""
     return _Rasterizer()
 
 
 class _Rasterizer:
-    """A context, a program, and the buffers of the scene and size drawn last."""
+    """An OpenGL context and program, with buffers for the scene and image size drawn last."""
 
     def __init__(self):
         with needs("scene"):
@@ -150,6 +155,7 @@ class _Rasterizer:
         farthest: float,
         start: Float[np.ndarray, "height width"],
     ) -> Int[np.ndarray, "height width"]:
+        """The face at each pixel, -1 for none; arguments are those of `_transforms`."""
         gl = self.gl
         height, width = start.shape
         gl.glBindVertexArray(self.vertex_array)
@@ -176,14 +182,16 @@ class _Rasterizer:
         gl.glClearBufferiv(gl.GL_COLOR, 0, np.array([-1, 0, 0, 0], np.int32))
         gl.glClearBufferfv(gl.GL_DEPTH, 0, np.array([1], np.float32))
         gl.glDrawArrays(gl.GL_TRIANGLES, 0, scene.unit_triangles.size // 3)
-        found = np.empty((height, width), np.int32)
-        gl.glReadPixels(0, 0, width, height, gl.GL_RED_INTEGER, gl.GL_INT, found)
-        return found
+        faces = np.empty((height, width), np.int32)
+        gl.glReadPixels(0, 0, width, height, gl.GL_RED_INTEGER, gl.GL_INT, faces)
+        return faces
 
     def _set(self, name: str, setter: Any, *value: Any) -> None:
+        """Set a uniform of the program."""
         setter(self.gl.glGetUniformLocation(self.program, name), *value)
 
     def _upload(self, scene: Scene) -> None:
+        """Put a scene's corners into the vertex buffer."""
         gl = self.gl
         corners = scene.unit_triangles
         gl.glBindBuffer(gl.GL_ARRAY_BUFFER, self.corners)
@@ -193,14 +201,17 @@ class _Rasterizer:
         self.scene = weakref.ref(scene)
 
     def _resize(self, height: int, width: int) -> None:
+        """Allocate the framebuffer and the texture of start depths for an image size."""
         gl = self.gl
-        for buffer, kind, place in (
+        for buffer, storage, attachment in (
             (self.faces, gl.GL_R32I, gl.GL_COLOR_ATTACHMENT0),
             (self.depth, gl.GL_DEPTH_COMPONENT32F, gl.GL_DEPTH_ATTACHMENT),
         ):
             gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
-            gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, kind, width, height)
-            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, place, gl.GL_RENDERBUFFER, buffer)
+            gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, storage, width, height)
+            gl.glFramebufferRenderbuffer(
+                gl.GL_FRAMEBUFFER, attachment, gl.GL_RENDERBUFFER, buffer
+            )
         state = gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER)
         if state != gl.GL_FRAMEBUFFER_COMPLETE:
             raise RuntimeError(f"OpenGL gives no framebuffer of {width} x {height}: {state}.")

@@ -1,4 +1,4 @@
-"""glTF files as JSON with the numbers and images that it points to.
+"""The JSON of a glTF file, and the accessors, images and resources that it refers to.
 
 Source: glTF 2.0 (Khronos 2017), 3.6, 3.8.3 and 4.4.
 """
@@ -13,28 +13,35 @@ from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 
-from jaxfx.scene._images import find_file
 from jaxfx.scene._part import UnreadableError
+from jaxfx.scene.formats._images import find_file
 
 
+# NumPy's types by `componentType`, and the numbers per row by `type`.
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+# The types of a GLB file's chunks.
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-_MOST_IMPLICIT = 1 << 26  # rows of an accessor that no buffer holds
-_NEEDED: Any = object()
+# Most rows of an accessor without a bufferView, which are zeros. Its `count` alone decides how
+# much memory they take: without a limit a damaged file could ask for all of it.
+_MAX_ZERO_ROWS = 1 << 26
+# Stands for "no default": the key must be there.
+_REQUIRED: Any = object()
+# How far a ratio may lie outside [0, 1] and still be taken for rounding, not for an error.
+ROUNDING = 1e-3
 
 
 def is_glb(data: bytes) -> bool:
-    """Whether a file is of the binary kind."""
+    """Whether a file is GLB, the binary form of glTF."""
     return data.startswith(b"glTF")
 
 
-def take(record: Any, key: str, kind: type, default: Any = _NEEDED) -> Any:
-    """`record[key]`, of the JSON type that `kind` is in Python; whole numbers are int."""
+def take(record: Any, key: str, kind: type, default: Any = _REQUIRED) -> Any:
+    """`record[key]`, which must be of the Python type `kind`; 3.0 passes for the integer 3."""
     if not isinstance(record, dict):
         raise UnreadableError(f"what should hold {key!r} is {record!r:.60}")
     if key not in record:
-        if default is _NEEDED:
+        if default is _REQUIRED:
             raise UnreadableError(f"{key!r} is missing in {record!r:.60}")
         return default
     value = record[key]
@@ -47,7 +54,7 @@ def take(record: Any, key: str, kind: type, default: Any = _NEEDED) -> Any:
 
 
 def vector(record: Any, key: str, default: list[float]) -> np.ndarray:
-    """`record[key]`, as many finite numbers as `default` has."""
+    """`record[key]`: a list of finite numbers, as long as `default`."""
     values = take(record, key, list, default)
     is_number = [isinstance(v, int | float) and not isinstance(v, bool) for v in values]
     if len(values) != len(default) or not all(is_number) or not np.isfinite(values).all():
@@ -55,16 +62,19 @@ def vector(record: Any, key: str, default: list[float]) -> np.ndarray:
     return np.array(values, np.float64)
 
 
-def share(record: Any, key: str, default: float) -> float:
-    """`record[key]`, a number from 0 to 1 but for rounding."""
+def ratio(record: Any, key: str, default: float) -> float:
+    """`record[key]`: a number in [0, 1]. What rounding has put outside is clamped."""
     value = take(record, key, float, default)
-    if not -1e-3 <= value <= 1 + 1e-3:
+    if not -ROUNDING <= value <= 1 + ROUNDING:
         raise UnreadableError(f"{key!r} must be in [0, 1], got {value}")
     return min(max(float(value), 0.0), 1.0)
 
 
 class Document:
-    """A file's JSON, its numbers and its images. `ignored` gathers what is left out."""
+    """A glTF file: its JSON, and access to what that refers to.
+
+    `ignored` collects the names of what the readers leave out.
+    """
 
     def __init__(self, path: Path, data: bytes):
         self.folder = path.parent
@@ -74,11 +84,11 @@ class Document:
         version = take(take(self.json, "asset", dict), "version", str)
         least = take(self.json["asset"], "minVersion", str, "2.0")
         if version.split(".")[0] != "2" or least not in ("2.0", "2"):
-            raise UnreadableError(f"it is of glTF version {version}, read is 2.0")
+            raise UnreadableError(f"it is of glTF version {version}; only 2.0 is read")
         self._buffers: dict[int, bytes] = {}
 
     def item(self, kind: str, index: Any) -> dict:
-        """Entry `index` of the list that is called `kind`."""
+        """Entry `index` of the top-level list `kind`, such as "nodes"."""
         entries = take(self.json, kind, list, [])
         if isinstance(index, float) and index.is_integer():
             index = int(index)
@@ -89,14 +99,14 @@ class Document:
             raise UnreadableError(f"entry {index} of {kind!r} is {entries[index]!r:.60}")
         return entries[index]
 
-    def extensions(self, record: dict, *known: str) -> dict:
-        """A record's extensions; those but `known` are left out."""
-        found = take(record, "extensions", dict, {})
-        self.ignored.update(set(found) - set(known))
-        return found
+    def extensions(self, record: dict, *supported: str) -> dict:
+        """A record's extensions; the names of all but `supported` are added to `ignored`."""
+        extensions = take(record, "extensions", dict, {})
+        self.ignored.update(set(extensions) - set(supported))
+        return extensions
 
     def accessor(self, index: Any, *, widths: tuple[int, ...]) -> np.ndarray:
-        """An accessor's rows: integers as they are stored, or float64; all of them finite."""
+        """An accessor's rows, count x width: stored integers, or finite float64."""
         record = self.item("accessors", index)
         dtype = self._dtype(record)
         width = _WIDTHS.get(take(record, "type", str))
@@ -106,7 +116,7 @@ class Document:
         if "bufferView" in record:
             offset = take(record, "byteOffset", int, 0)
             rows = self._rows(record["bufferView"], offset, count, width, dtype)
-        elif count > _MOST_IMPLICIT:
+        elif count > _MAX_ZERO_ROWS:
             raise UnreadableError(f"accessor {index} has {count} rows and no bufferView")
         else:
             rows = np.zeros((count, width), dtype)
@@ -121,32 +131,26 @@ class Document:
         return rows
 
     def _replaced(self, rows: np.ndarray, sparse: dict) -> np.ndarray:
-        """`rows` with those that a sparse accessor names."""
+        """`rows` with the substitutions of a sparse accessor applied."""
         count = take(sparse, "count", int)
-        place, value = (take(sparse, key, dict) for key in ("indices", "values"))
-        for each in (place, value):
-            if "byteStride" in self.item("bufferViews", each.get("bufferView")):
+        index_record, value_record = (take(sparse, key, dict) for key in ("indices", "values"))
+
+        def read(record: dict, width: int, dtype: np.dtype) -> np.ndarray:
+            if "byteStride" in self.item("bufferViews", record.get("bufferView")):
                 raise UnreadableError("sparse values must lie side by side, without byteStride")
-        where, what = (
-            self._rows(
-                take(each, "bufferView", int),
-                take(each, "byteOffset", int, 0),
-                count,
-                width,
-                dtype,
-            )
-            for each, width, dtype in (
-                (place, 1, self._dtype(place)),
-                (value, rows.shape[1], rows.dtype),
-            )
-        )
-        if where.dtype.kind != "u" or (where.size and where.max() >= len(rows)):
-            raise UnreadableError(f"sparse values for {len(rows)} rows are at {where.max()}")
+            offset = take(record, "byteOffset", int, 0)
+            return self._rows(take(record, "bufferView", int), offset, count, width, dtype)
+
+        index = read(index_record, 1, self._dtype(index_record))
+        values = read(value_record, rows.shape[1], rows.dtype)
+        if index.dtype.kind != "u" or (index.size and index.max() >= len(rows)):
+            raise UnreadableError(f"sparse values for {len(rows)} rows are at {index.max()}")
         rows = rows.copy()
-        rows[where[:, 0]] = what
+        rows[index[:, 0]] = values
         return rows
 
     def _dtype(self, record: dict) -> np.dtype:
+        """NumPy's type for a record's `componentType`."""
         kind = take(record, "componentType", int)
         if kind not in _COMPONENTS:
             raise UnreadableError(f"there is no componentType {kind}")
@@ -155,6 +159,7 @@ class Document:
     def _rows(
         self, view: Any, offset: int, count: int, width: int, dtype: np.dtype
     ) -> np.ndarray:
+        """`count` rows of `width` numbers in a bufferView, from byte `offset` on."""
         memory, stride = self._view(view)
         size = width * dtype.itemsize
         step = size if stride is None else stride
@@ -168,10 +173,10 @@ class Document:
         return np.ndarray(shape, dtype, memory, offset, strides)
 
     def _view(self, index: Any) -> tuple[memoryview, int | None]:
-        """A bufferView's bytes and stride."""
+        """A bufferView's bytes, and its stride in bytes where it states one."""
         record = self.item("bufferViews", index)
-        packed = ", ".join(self.extensions(record))
-        data = self._buffer(record.get("buffer"), packed)
+        extensions = ", ".join(self.extensions(record))
+        data = self._buffer(record.get("buffer"), extensions)
         offset, length = take(record, "byteOffset", int, 0), take(record, "byteLength", int)
         if offset < 0 or length < 1 or offset + length > len(data):
             raise UnreadableError(
@@ -180,7 +185,8 @@ class Document:
         stride = take(record, "byteStride", int, None)
         return memoryview(data)[offset : offset + length], stride
 
-    def _buffer(self, index: Any, packed: str) -> bytes:
+    def _buffer(self, index: Any, extensions: str) -> bytes:
+        """A buffer's bytes; `extensions`, the bufferView's, are named where there are none."""
         record = self.item("buffers", index)
         if index not in self._buffers:
             if "uri" in record:
@@ -188,8 +194,8 @@ class Document:
             elif self.binary is not None and index == 0:
                 data = self.binary
             else:
-                only = f" but by {packed}, which is not read" if packed else ""
-                raise UnreadableError(f"buffer {index} has no data{only}")
+                hint = f" but by {extensions}, which is not read" if extensions else ""
+                raise UnreadableError(f"buffer {index} has no data{hint}")
             length = take(record, "byteLength", int)
             if length > len(data):
                 raise UnreadableError(
@@ -199,7 +205,7 @@ class Document:
         return self._buffers[index]
 
     def image(self, index: Any) -> tuple[bytes, str]:
-        """An image's file and its name."""
+        """The bytes of an image file, and a name for it."""
         record = self.item("images", index)
         if "uri" in record:
             return self.resource(take(record, "uri", str))
@@ -207,16 +213,16 @@ class Document:
         return bytes(data), take(record, "name", str, f"images[{index}]")
 
     def resource(self, uri: str) -> tuple[bytes, str]:
-        """What a URI names, and that name: data within it, or a file beside this one."""
-        head, separator, body = uri.partition(":")
-        if head.lower() == "data" and separator:
-            kind, comma, code = body.partition(",")
+        """The bytes that a URI refers to, and a name: a data URI, or a file beside this one."""
+        scheme, separator, body = uri.partition(":")
+        if scheme.lower() == "data" and separator:
+            media_type, comma, code = body.partition(",")
             if not comma:
                 raise UnreadableError(f"the URI {uri!r:.40} has no data")
-            if not kind.endswith(";base64"):
-                return unquote_to_bytes(code), f"data:{kind}"
+            if not media_type.endswith(";base64"):
+                return unquote_to_bytes(code), f"data:{media_type}"
             try:
-                return base64.b64decode(unquote(code), validate=True), f"data:{kind}"
+                return base64.b64decode(unquote(code), validate=True), f"data:{media_type}"
             except binascii.Error as error:
                 raise UnreadableError(f"the URI {uri!r:.40} is not base64: {error}") from error
         if body.startswith("//"):
@@ -225,22 +231,24 @@ class Document:
 
 
 def _refuse(constant: str) -> float:
+    """Refuse NaN and Infinity, which Python's JSON accepts and glTF does not."""
     raise UnreadableError(f"its JSON holds {constant}")
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """The JSON and the binary chunk of a GLB file."""
+    """The JSON of a GLB file, and its binary chunk or None."""
     if len(data) < 12:
-        raise UnreadableError(f"it has {len(data)} bytes, the head of a GLB file 12")
+        raise UnreadableError(f"it has {len(data)} bytes, fewer than the 12 of a GLB header")
     _, version, length = struct.unpack_from("<4sII", data)
     if version != 2 or length > len(data):
         raise UnreadableError(
-            f"it is GLB version {version} of {length} bytes, read is version 2, got {len(data)}"
+            f"it is GLB version {version} of {length} bytes; only version 2 is read, and the "
+            f"file has {len(data)} bytes"
         )
     chunks, at = [], 12
     while at < length:
         if at + 8 > length:
-            raise UnreadableError(f"it ends within the head of chunk {len(chunks)}")
+            raise UnreadableError(f"it ends within the header of chunk {len(chunks)}")
         size, kind = struct.unpack_from("<II", data, at)
         if at + 8 + size > length:
             raise UnreadableError(f"chunk {len(chunks)} of {size} bytes goes on past its end")

@@ -1,4 +1,4 @@
-"""Images that mesh files name or hold, as textures."""
+"""Image files that mesh files refer to or contain, as textures."""
 
 import io
 from collections.abc import Iterator
@@ -9,88 +9,94 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from jaxfx._extras import MissingExtraError, needs
-from jaxfx.io._pixels import jpeg_values, png_values
+from jaxfx.io.color import jpeg_values
+from jaxfx.io.png import png_values
 from jaxfx.scene._part import UnreadableError
 
 
 _Texture = UInt8[np.ndarray, "height width 3"] | UInt16[np.ndarray, "height width 3"]
+# The first bytes of PNG and JPEG files, and of those that Pillow decodes.
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _OTHERS = {b"BM": "BMP", b"II*\0": "TIFF", b"MM\0*": "TIFF", b"RIFF": "WEBP", b"GIF8": "GIF"}
 
 
 def find_file(folder: Path, *names: str) -> Path:
-    """The file that a mesh file calls by one of `names`, relative to `folder`.
+    """The file that a mesh file refers to by one of `names`, relative to `folder`.
 
-    Where there is none, a backslash parts folders too, and then capitals do not count: so the
-    file is found as on the system that it was written on.
+    If there is none, backslashes are read as separators, then letter case is ignored, as on
+    Windows, where many mesh files are written.
     """
     for name in names:
         for spelled in (name, name.replace("\\", "/")):
             if spelled and (folder / spelled).is_file():
                 return folder / spelled
     for name in names:
-        found = list(_in_any_case(folder, name.replace("\\", "/")))
-        if len(found) == 1:
-            return found[0]
-        if found:
-            same = " and ".join(repr(str(path)) for path in found[:2])
-            raise UnreadableError(f"{name!r} is the name of {same}")
+        paths = list(_in_any_case(folder, name.replace("\\", "/")))
+        if len(paths) == 1:
+            return paths[0]
+        if paths:
+            first_two = " and ".join(repr(str(path)) for path in paths[:2])
+            raise UnreadableError(f"{name!r} is the name of {first_two}")
     raise UnreadableError(f"there is no file {names[0]!r} in {str(folder)!r}")
 
 
 def _in_any_case(folder: Path, name: str) -> Iterator[Path]:
-    places = [folder]
+    """The files called `name` in `folder`, letter case ignored in every part of the path."""
+    paths = [folder]
     for part in Path(name).parts:
         if part in (".", "..", "/"):
-            places = [place / part for place in places]
+            paths = [path / part for path in paths]
         else:
-            places = [
-                inside
-                for place in places
-                if place.is_dir()
-                for inside in place.iterdir()
-                if inside.name.casefold() == part.casefold()
+            paths = [
+                entry
+                for path in paths
+                if path.is_dir()
+                for entry in path.iterdir()
+                if entry.name.casefold() == part.casefold()
             ]
-    return (place for place in places if place.is_file())
+    return (path for path in paths if path.is_file())
 
 
 def read_image(data: bytes, name: str) -> _Texture:
-    """The colours of an image file, without alpha, in the file's own 8 or 16 bits."""
+    """The colours of an image file, without alpha, in 8 or 16 bits as in the file.
+
+    `name` stands for the image in errors.
+    """
     try:
         return _colors(data, name)
-    except UnreadableError:
-        raise
-    except MissingExtraError:
+    except (UnreadableError, MissingExtraError):
         raise
     except Exception as error:
         raise UnreadableError(f"the image {name!r} can't be read: {error}") from error
 
 
 def _colors(data: bytes, name: str) -> _Texture:
+    """As `read_image`, with whatever error the decoder raises."""
     if data.startswith(_PNG):
         values = png_values(data)
         dtype = np.dtype(np.uint16 if data[24] == 16 else np.uint8)
     elif data.startswith(_JPEG):
         values, dtype = jpeg_values(data), np.dtype(np.uint8)
     else:
-        return _by_pillow(data, name)
+        return _decode_with_pillow(data, name)
     codes = np.rint(values * np.iinfo(dtype).max).astype(dtype)
-    return _three(codes)
+    return _rgb(codes)
 
 
-def _three(codes: np.ndarray) -> _Texture:
-    """RGB of grey, grey and alpha, RGB or RGBA."""
+def _rgb(codes: np.ndarray) -> _Texture:
+    """The RGB channels of grey, grey and alpha, RGB or RGBA."""
     if codes.shape[2] < 3:
         codes = np.repeat(codes[:, :, :1], 3, axis=2)
     return np.ascontiguousarray(codes[:, :, :3])
 
 
-def _by_pillow(data: bytes, name: str) -> _Texture:
+def _decode_with_pillow(data: bytes, name: str) -> _Texture:
+    """The colours of a BMP, TIFF, WebP, GIF or TGA file."""
     with needs("scene"):
         from PIL import Image
 
     kinds = [kind for start, kind in _OTHERS.items() if data.startswith(start)]
-    if not kinds and name.lower().endswith(".tga"):  # TGA files have no sign of their own
+    if not kinds and name.lower().endswith(".tga"):  # TGA files do not begin with fixed bytes.
         kinds = ["TGA"]
     if not kinds:
         raise UnreadableError(
@@ -101,10 +107,10 @@ def _by_pillow(data: bytes, name: str) -> _Texture:
 
 
 def pillow_codes(image: Any, name: str) -> _Texture:
-    """The colours of an image of Pillow's, in 8 bits or, of 16-bit grey, in 16."""
+    """The RGB codes of a Pillow image: uint8, or uint16 where it is 16-bit grey."""
     is_wide_png = image.mode == "I" and image.format == "PNG"
     if image.mode.startswith("I;16") or is_wide_png:
-        return _three(np.asarray(image).astype(np.uint16)[:, :, None])
+        return _rgb(np.asarray(image).astype(np.uint16)[:, :, None])
     if image.mode in ("I", "F"):
         raise UnreadableError(f"the image {name!r} has neither 8 nor 16 bits a channel")
     return np.asarray(image.convert("RGBA").convert("RGB"))

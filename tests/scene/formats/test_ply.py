@@ -145,7 +145,7 @@ def test_textures(tmp_path, texels, codes, names, order):
         (lambda t: t.replace("3 0 1 2", "3 0 1 1.5"), "a number is no int32"),
         (lambda t: t + " 7", "numbers are left over"),
         (lambda t: t[:-2], "it ends early"),
-        (lambda t: t.replace("format ascii", "format ebcdic"), "its head says 'format ebcdic"),
+        (lambda t: t.replace("format ascii", "format ebcdic"), "header says 'format ebcdic"),
         (lambda t: t.replace("element face", "element tristrips"), "tristrips"),
         (lambda t: t.replace("float z", "float q"), "has no x, y, z"),
         (lambda t: t.replace("comment", "comment TextureFile gone.png"), "no file 'gone.png'"),

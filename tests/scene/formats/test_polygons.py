@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from skimage.measure import points_in_poly
 
-from jaxfx.scene._polygons import triangulate
+from jaxfx.scene.formats._polygons import triangulate
 
 
 def shoelace(polygon):
