@@ -50,7 +50,7 @@ class Filter(eqx.Module):
         *data, bias, slope_bias, _ = _taps.checked("shadow", *data, size=self.full_size)
         how = {"size": self.size, "bias": bias, "slope_bias": slope_bias}
         if self.masked and self.size > 1:
-            return edge_pcf(*data, mask="depth", **how)
+            return edge_pcf(*data, edges="depth", **how)
         return pcf(*data, **how)
 
 

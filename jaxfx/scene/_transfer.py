@@ -18,10 +18,11 @@ from jaxfx._arguments import check_camera, check_gbuffer
 from jaxfx._checks import as_numpy, whole_number
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.gbuffer import GBuffer, Transfer
+from jaxfx.gbuffer import GBuffer
 from jaxfx.scene import _embree
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._surface import Hits, at_hits
+from jaxfx.transfer import Transfer
 
 
 _CANDIDATES = 16  # for each point

@@ -29,7 +29,7 @@ def light_cameras(
     light: Light,
     *,
     map_size: WholeNumber,
-    centre: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    center: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
     radius: Float[ArrayLike, ""] | float = 1.0,
     margin: WholeNumber = 0,
 ) -> tuple[PinholeCamera | OrthographicCamera, ...]:
@@ -48,7 +48,7 @@ def light_cameras(
 
     - `light`: any of the four.
     - `map_size`: static; height and width of a map, in pixels.
-    - `centre`, `radius`: the ball that holds the scene, 3 and a scalar, in scene units; a
+    - `center`, `radius`: the ball that holds the scene, 3 and a scalar, in scene units; a
       directional light's camera stands two radii before the centre.
     - `margin`: static; pixels by which each map is wider on each side than the ball, the cone
       or the cube's face: half a filter's size, lest a filter reach past a face.
@@ -58,7 +58,7 @@ def light_cameras(
     **Raises:** `ValueError` for a radius that is not positive, a margin that fills the map, or
     a spot light's cone of pi or more.
 
-    **Gradient:** exact with respect to the light, `centre` and `radius`; zero along the light's
+    **Gradient:** exact with respect to the light, `center` and `radius`; zero along the light's
     own roll, which is arbitrary, and at a direction of zero.
 
     Source: Williams 1978; the cube is that of Greene 1986's environment maps.
@@ -71,16 +71,16 @@ def light_cameras(
         lambda n: 0 <= 2 * n < map_size,
         f"0 or more and below half of `map_size`, which is {map_size}",
     )
-    centre = parameter("light_cameras(centre=...)", centre, (3,))
+    center = parameter("light_cameras(center=...)", center, (3,))
     radius = parameter("light_cameras(radius=...)", radius)
-    check("light_cameras(centre=...)", centre, np.isfinite, "finite")
+    check("light_cameras(center=...)", center, np.isfinite, "finite")
     check("light_cameras(radius=...)", radius, lambda v: (v > 0) & (v < np.inf), "positive")
     inner = map_size - 2 * margin
     if isinstance(light, AmbientLight):
         return ()
     if isinstance(light, DirectionalLight):
         forward = normalize(light.direction)
-        pose = _pose(centre.astype(forward.dtype) - 2 * radius * forward, forward)
+        pose = _pose(center.astype(forward.dtype) - 2 * radius * forward, forward)
         middle = [map_size / 2, map_size / 2]
         return (OrthographicCamera(inner / (2 * radius), middle, pose),)
     if isinstance(light, SpotLight):

@@ -16,7 +16,7 @@ from jaxfx.shadow._taps import Kernel
 from jaxfx.shadow.receivers import Receivers
 
 
-Mask = Literal["screen", "depth"]
+Edges = Literal["screen", "depth"]
 
 # The share of edges at which a dilation that is left out is enough.
 _USUAL = 0.75
@@ -26,7 +26,7 @@ class Candidates(NamedTuple):
     """What `edge_pcf` filters, and what that costs.
 
     - `where`: height width; the pixels that are filtered, B of I.
-    - `comparisons`: a scalar count: `I + B * size**2` with `mask="screen"`; with `"depth"`
+    - `comparisons`: a scalar count: `I + B * size**2` with `edges="screen"`; with `"depth"`
       I more, for the smallest and the largest texel are both compared.
     """
 
@@ -43,16 +43,16 @@ def edge_pcf(
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
     kernel: Kernel = "box",
-    mask: Mask = "depth",
+    edges: Edges = "depth",
     dilation: WholeNumber | None = None,
 ) -> Float[Array, "height width"]:
     """Percentage-closer filtering near the edges of shadows alone: O(I + B * size**2).
 
-    With `mask="depth"`, the default, a pixel is filtered where the smallest and the largest of
+    With `edges="depth"`, the default, a pixel is filtered where the smallest and the largest of
     its texels, a running minimum and maximum of the map, are not both lit or both shadowed.
     Nothing is lost: the result is `pcf`'s, to the last bit with the box and no softness.
 
-    With `mask="screen"`, the paper's, the edges of the hard shadow are found in the image and
+    With `edges="screen"`, the paper's, the edges of the hard shadow are found in the image and
     dilated; what they enclose is filtered, the rest is the hard shadow. Shadows that fall
     between pixels have no edge and are lost.
 
@@ -60,8 +60,8 @@ def edge_pcf(
 
     - `shadow_map`, `receivers`, `size`, `bias`, `slope_bias`, `softness`, `kernel`: as in
       `pcf`: height width, texels and scene units.
-    - `mask`: which pixels are filtered.
-    - `dilation`: static; pixels by which edges reach, of `mask="screen"` alone. Outside `jit`,
+    - `edges`: which pixels are filtered.
+    - `dilation`: static; pixels by which edges reach, of `edges="screen"` alone. Outside `jit`,
       `grad` and `vmap` it may be left out, and is then as many as the filter covers at three
       of four edge pixels. Where light grazes a surface it covers more, without limit.
 
@@ -70,11 +70,11 @@ def edge_pcf(
     are done one by one. On an accelerator every pixel is filtered, which is quicker there, and
     the mask selects.
 
-    **Raises:** `ValueError` as `pcf` does, for an unknown mask, a dilation that is not 1 or
-    more, one with `mask="depth"`, or none with `mask="screen"` under a transform.
+    **Raises:** `ValueError` as `pcf` does, for an unknown `edges`, a dilation that is not 1 or
+    more, one with `edges="depth"`, or none with `edges="screen"` under a transform.
 
     **Gradient:** `pcf`'s in the pixels that are filtered, on a CPU at the cost of these; zero
-    in the others: exact with `mask="depth"`, missing with `"screen"` where that misses. The
+    in the others: exact with `edges="depth"`, missing with `"screen"` where that misses. The
     mask is constant. Second derivatives cost a full filter.
 
     Source: Yu & Choi, an improved PCF technique for the generation of shadows, section 4;
@@ -84,8 +84,8 @@ def edge_pcf(
     data = (shadow_map, receivers, bias, slope_bias, softness)
     data = _taps.checked("edge_pcf", *data, size=size, kernel=kernel)
     size = int(size)
-    dilation = _reach("edge_pcf", mask, dilation, size, data)
-    return _edge_pcf(size, kernel, mask, dilation, *_taps.without_gradient(kernel, data))
+    dilation = _reach("edge_pcf", edges, dilation, size, data)
+    return _edge_pcf(size, kernel, edges, dilation, *_taps.without_gradient(kernel, data))
 
 
 def candidates(
@@ -96,12 +96,12 @@ def candidates(
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
-    mask: Mask = "depth",
+    edges: Edges = "depth",
     dilation: WholeNumber | None = None,
 ) -> Candidates:
     """The pixels that `edge_pcf` filters, and the number of comparisons that it makes.
 
-    With `mask="screen"` and `dilation=1` these are the edges themselves.
+    With `edges="screen"` and `dilation=1` these are the edges themselves.
 
     **Arguments:** as in `edge_pcf`: height width, texels, scene units and pixels.
 
@@ -116,20 +116,20 @@ def candidates(
     data = (shadow_map, receivers, bias, slope_bias, softness)
     data = _taps.checked("candidates", *data, size=size)
     size = int(size)
-    where = _candidates(size, mask, _reach("candidates", mask, dilation, size, data), *data)
-    tests = where.size * (2 if mask == "depth" else 1)
+    where = _candidates(size, edges, _reach("candidates", edges, dilation, size, data), *data)
+    tests = where.size * (2 if edges == "depth" else 1)
     taps = jnp.sum(where, dtype=jnp.uint32) * size**2
     return Candidates(where, tests + taps)
 
 
-def _reach(name: str, mask: Any, dilation: Any, size: int, data: Any) -> int:
+def _reach(name: str, edges: Any, dilation: Any, size: int, data: Any) -> int:
     """The dilation, checked; found if it is left out; 0 where there is none."""
-    option(f"{name}(mask=...)", mask, get_args(Mask))
-    if mask == "depth":
+    option(f"{name}(edges=...)", edges, get_args(Edges))
+    if edges == "depth":
         if dilation is not None:
             raise ValueError(
-                f'`{name}(dilation=...)` must be left out with `mask="depth"`, which needs '
-                f'none: `mask="screen"` dilates, got {dilation!r}.'
+                f'`{name}(dilation=...)` must be left out with `edges="depth"`, which needs '
+                f'none: `edges="screen"` dilates, got {dilation!r}.'
             )
         return 0
     if dilation is None:
@@ -164,8 +164,8 @@ def usual_dilation(
 
 
 @ft.partial(jax.jit, static_argnums=(0, 1, 2))
-def _candidates(size, mask, dilation, *data):
-    return find_mask(size, mask, dilation, *jax.lax.stop_gradient(data))[1]
+def _candidates(size, edges, dilation, *data):
+    return find_mask(size, edges, dilation, *jax.lax.stop_gradient(data))[1]
 
 
 _edge_pcf = jax.jit(masked, static_argnums=(0, 1, 2, 3))
