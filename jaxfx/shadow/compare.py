@@ -81,7 +81,7 @@ def find_places(
     receivers: Receivers,
     bias: Float[Array, ""],
     slope_bias: Float[Array, ""],
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     size: int,
     dtype: Any,
 ) -> Places:

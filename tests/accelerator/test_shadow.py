@@ -22,10 +22,10 @@ from tests.shadow.test_edge import (  # noqa: F401
 
 
 @pytest.mark.parametrize("edges", ["depth", "screen"])
-def test_the_filter_is_taken_where_the_mask_asks_for_it(case, mask):  # noqa: F811
+def test_the_filter_is_taken_where_the_mask_asks_for_it(case, edges):  # noqa: F811
     """Every pixel by the naive loop; by the screen those that no edge reaches stay hard."""
     options = {"size": 7, "edges": edges, "bias": 0.02}
-    options |= {"dilation": 2} if mask == "screen" else {}
+    options |= {"dilation": 2} if edges == "screen" else {}
     visible = shadow.edge_pcf(*case, **options)
     where = shadow.candidates(*case, **options).where
     full, hard = (naive_pcf(*case, size, bias=0.02) for size in (7, 1))
