@@ -325,14 +325,14 @@ def shadowed(at: Point) -> Case:
     sizes = tuple(dict.fromkeys((at.own, 3, 7, 15)))
     several = lambda method, **how: {f"{n}": of(method, n, size=n, **how) for n in sizes}
     one = lambda method, **how: {"": of(method, at.own, size=at.own, **how)}
-    reach = lambda n: {"size": n, "mask": "screen", "dilation": n // 2 + 2}
+    reach = lambda n: {"size": n, "edges": "screen", "dilation": n // 2 + 2}
     plan = functools.partial(budget.shadow, size=at.own, bias=0.01, slope_bias=at.own / 2)
     methods = {
         "hard": {"": of(shadow.hard, 1)},
         "pcf": several(shadow.pcf),
         "pcf, tent": one(shadow.pcf, kernel="tent"),
         "pcf, Gaussian": one(shadow.pcf, kernel="gaussian"),
-        "edges by depth": several(shadow.edge_pcf, mask="depth"),
+        "edges by depth": several(shadow.edge_pcf, edges="depth"),
         "edges by screen": {f"{n}": of(shadow.edge_pcf, n, **reach(n)) for n in sizes},
         "prefiltered": several(shadow.prefiltered),
         "variance": several(shadow.variance),
@@ -381,10 +381,8 @@ def relit(at: Point) -> Case:
         def call(data):
             caches, eyes = (each[:count] for each in data["caches"])
             gbuffer, camera, lights = data["of"]
-            found, coverage = relight.synthesize(
-                caches, eyes, camera, depth=gbuffer.depth, **how
-            )
-            return relight.render(relight.fill_holes(found, coverage)[0], camera, lights)
+            found, views = relight.synthesize(caches, eyes, camera, depth=gbuffer.depth, **how)
+            return relight.render(relight.fill_holes(found, views)[0], camera, lights)
 
         return call
 
@@ -403,7 +401,7 @@ def relit(at: Point) -> Case:
             ),
         },
         "new view": {f"from {n}": new_view(n) for n in (4, 1, 2)}
-        | {"from 4, by detail": new_view(4, weights="detail")},
+        | {"from 4, by detail": new_view(4, weighting="detail")},
         "plan": plans(budget.relight, lambda data: data["of"]),
     }
     return Case((data,), relight.render(*data["of"]), methods)

@@ -127,7 +127,7 @@ def shadows(side):
     camera = PinholeCamera.from_fov(0.8, height=side, width=side)
     options = {"size": 7, "bias": 0.05}
     pcf = lambda *data: shadow.pcf(*data, **options)
-    edge = lambda *data: shadow.edge_pcf(*data, mask="depth", **options)
+    edge = lambda *data: shadow.edge_pcf(*data, edges="depth", **options)
     soft = lambda *data: shadow.pcss(*data, light_size=0.2, **options)
     return {
         "pcf 7 x 7": Row(pcf, data, 2 * 49 * side**2),
@@ -145,8 +145,8 @@ def lighting(side):
     _, depth, target = _view(side, 0.15)
 
     def view(gbuffers, cameras, target, depth):
-        found, coverage = relight.synthesize(gbuffers, cameras, target, depth=depth)
-        return relight.fill_holes(found, coverage)[0]
+        found, views = relight.synthesize(gbuffers, cameras, target, depth=depth)
+        return relight.fill_holes(found, views)[0]
 
     return {
         "render of 8 lights": Row(relight.render, (gbuffers[0], cameras[0], lights)),

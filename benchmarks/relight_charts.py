@@ -68,7 +68,7 @@ def bounce(mesh, camera, gbuffer, path):
         full = scene.transfer(mesh, gbuffer, camera, point_count=points, rank=most)
         lit = truth.unshadowed(mesh, full.position, light)
         send = lambda rank, full=full, lit=lit: np.asarray(
-            relight.indirect(gbuffer, truncated(full, rank), [light], lit=[lit])
+            relight.indirect(gbuffer, truncated(full, rank), [light], visibilities=[lit])
         )
         images[points] = whole = send(most)
         for rank in 2 ** np.arange(int(np.log2(most)) + 1):

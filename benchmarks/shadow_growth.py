@@ -33,8 +33,8 @@ def methods(size, scene):
     masked = ft.partial(shadow.edge_pcf, size=size)
     functions = {
         "pcf": ft.partial(shadow.pcf, size=size),
-        "screen mask": ft.partial(masked, mask="screen", dilation=dilation),
-        "depth mask": ft.partial(masked, mask="depth"),
+        "screen mask": ft.partial(masked, edges="screen", dilation=dilation),
+        "depth mask": ft.partial(masked, edges="depth"),
         "variance": ft.partial(shadow.variance, size=size),
         "prefiltered": ft.partial(shadow.prefiltered, size=size),
         "pcss": lambda *data, bias: shadow.pcss(

@@ -71,25 +71,23 @@ def test_new_view(benchmark, count):
     light = scenes.lights(1)
 
     def view():
-        found, coverage = relight.synthesize(gbuffers, cameras, target, depth=depth)
-        return relight.render(relight.fill_holes(found, coverage)[0], target, light)
+        found, views = relight.synthesize(gbuffers, cameras, target, depth=depth)
+        return relight.render(relight.fill_holes(found, views)[0], target, light)
 
     run(benchmark, view)
 
 
-@pytest.mark.parametrize("step", ["synthesize", "fill_holes", "best_caches", "render"])
+@pytest.mark.parametrize("step", ["synthesize", "fill_holes", "choose", "render"])
 def test_steps_of_a_new_view(benchmark, step):
     benchmark.group = "the steps of a new view from 4 caches"
     target, depth, gbuffers, cameras = scenes.new_view(SIZE, 4)
     view = lambda: relight.synthesize(gbuffers, cameras, target, depth=depth)
-    found, coverage = view()
+    found, views = view()
     light = scenes.lights(1)
     steps = {
         "synthesize": view,
-        "fill_holes": lambda: relight.fill_holes(found, coverage),
-        "best_caches": lambda: relight.best_caches(
-            gbuffers, cameras, target, depth=depth, count=2
-        ),
+        "fill_holes": lambda: relight.fill_holes(found, views),
+        "choose": lambda: relight.choose(gbuffers, cameras, target, depth=depth, count=2),
         "render": lambda: relight.render(found, target, light),
     }
     run(benchmark, steps[step])

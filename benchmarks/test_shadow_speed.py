@@ -32,13 +32,13 @@ def program(function, shadow_map, receivers, **options):
     return lambda: jax.block_until_ready(compiled(*data))
 
 
-def masked(mask, size, shadow_map, receivers):
+def masked(edges, size, shadow_map, receivers):
     """The options of `edge_pcf`: the screen mask reaches as far as it would outside `jit`."""
-    if mask == "depth":
-        return {"size": size, "mask": mask}
+    if edges == "depth":
+        return {"size": size, "edges": edges}
     data = jnp.asarray(shadow_map), shadow.Receivers(*map(jnp.asarray, receivers))
     reach = usual_dilation(*data, jnp.float32(BIAS), jnp.float32(0), size)
-    return {"size": size, "mask": mask, "dilation": reach}
+    return {"size": size, "edges": edges, "dilation": reach}
 
 
 @pytest.mark.parametrize("size", [7, 21])
@@ -74,5 +74,5 @@ def test_without_an_edge(benchmark, method):
     if method == "pcf":
         run(benchmark, program(shadow.pcf, *scene, size=21))
     else:
-        options = {"size": 21, "mask": method, "dilation": 14 if method == "screen" else None}
+        options = {"size": 21, "edges": method, "dilation": 14 if method == "screen" else None}
         run(benchmark, program(shadow.edge_pcf, *scene, **options))

@@ -189,12 +189,12 @@ class Studio:
             depth = clock("depth", lambda: stage.depth(camera))
         else:
             depth = clock("depth", lambda: warped_depth(self.caches, self.cameras, camera))
-        found, coverage = clock(
+        found, views = clock(
             "synthesize",
             lambda: relight.synthesize(self.caches, self.cameras, camera, depth=depth),
         )
         self.camera = camera
-        self.gbuffer, holes = clock("fill", lambda: relight.fill_holes(found, coverage))
+        self.gbuffer, holes = clock("fill", lambda: relight.fill_holes(found, views))
         lit = clock("shadow", lambda: visibility(stage, self.gbuffer, camera, light))
         lights, visible = [light, *self.others], [lit, *(None for _ in self.others)]
         self.state = clock(

@@ -95,9 +95,9 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
     seen = np.isfinite(gbuffer.depth)
     depth = jnp.where(seen, gbuffer.depth, 1)
     points = np.asarray(camera.points(depth))[seen]
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = float(np.linalg.norm(points - centre, axis=-1).max())
-    (light_camera,) = shadow.light_cameras(key, map_size=map_size, centre=centre, radius=radius)
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - center, axis=-1).max())
+    (light_camera,) = shadow.light_cameras(key, map_size=map_size, center=center, radius=radius)
     shadow_map = scene.depth(mesh, light_camera, height=map_size, width=map_size)
     receivers = shadow.receivers(gbuffer.depth, camera, light_camera, normal=gbuffer.normal)
 
@@ -110,8 +110,8 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
 def options(size: int, dilation: int | None) -> dict[str, dict[str, Any]]:
     """Of every method; a plane stays lit if the bias grows with its slope."""
     same = {"size": size, "slope_bias": size / 2}
-    screen = {"mask": "screen", "dilation": dilation or size // 2 + 1}
-    return {FULL: same, DEPTH: same | {"mask": "depth"}, SCREEN: same | screen}
+    screen = {"edges": "screen", "dilation": dilation or size // 2 + 1}
+    return {FULL: same, DEPTH: same | {"edges": "depth"}, SCREEN: same | screen}
 
 
 def timed(stage: Stage, function, **how):
@@ -165,7 +165,7 @@ def draw_steps(stage: Stage, size: int, visible, where, path: Path) -> None:
     bias = {"bias": stage.bias, "slope_bias": size / 2}
     data = stage.shadow_map, stage.receivers
     hard = stage.picture(shadow.hard(*data, **bias))
-    edges = shadow.candidates(*data, size=size, mask="screen", dilation=1, **bias).where
+    edges = shadow.candidates(*data, size=size, edges="screen", dilation=1, **bias).where
     steps = {
         "hard shadow": hard,
         "its edges": marked(hard, np.asarray(edges)),

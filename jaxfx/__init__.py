@@ -33,9 +33,10 @@ import importlib
 from typing import Any
 
 from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
-from jaxfx.gbuffer import GBuffer, Transfer
+from jaxfx.gbuffer import GBuffer
 from jaxfx.lens import FocusPlanes, Lens, ThinLens
 from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
+from jaxfx.transfer import Transfer
 
 
 __version__ = "0.1.0.dev0"

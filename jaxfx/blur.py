@@ -151,7 +151,7 @@ def binomial_weights(taps: WholeNumber, *, row: WholeNumber) -> Float[Array, "ta
 
 
 def linear_taps(
-    weights: Float[ArrayLike, "taps"],
+    tap_weights: Float[ArrayLike, "taps"],
 ) -> tuple[Float[Array, "reads"], Float[Array, "reads"]]:
     """Half as many reads between the pixels, by linear interpolation, for the same sum.
 
@@ -160,7 +160,7 @@ def linear_taps(
     symmetric: where the middle tap of an odd kernel would leave one over, it is halved between
     both sides. So n taps take (n + 1) // 2 reads.
 
-    **Arguments:** `weights`: of the taps, one pixel apart, none negative. The middle is at
+    **Arguments:** `tap_weights`: of the taps, one pixel apart, none negative. The middle is at
     offset 0: on a pixel for an odd number of taps, between two pixels for an even one.
 
     **Returns:** `offsets`, in pixels from the middle, ascending, and `weights`, one a read. A
@@ -174,13 +174,13 @@ def linear_taps(
 
     Source: Rakos 2010, efficient Gaussian blur with linear sampling; the halved middle is ours.
     """
-    array = as_array("linear_taps(weights)", weights)
+    array = as_array("linear_taps(tap_weights)", tap_weights)
     if array.ndim != 1 or not array.size or not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(
-            "`linear_taps(weights)` must be a vector of floats, "
+            "`linear_taps(tap_weights)` must be a vector of floats, "
             f"got {array.dtype} of shape {array.shape}."
         )
-    check("linear_taps(weights)", array, lambda v: v >= 0, "0 or positive")
+    check("linear_taps(tap_weights)", array, lambda v: v >= 0, "0 or positive")
     reads = linear_reads(array)
     middle = (array.size - 1) / 2
     offsets = jnp.stack([first - middle + share for first, share, _ in reads])

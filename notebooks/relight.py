@@ -204,8 +204,8 @@ widgets.VBox([view, *sliders.values()])
 
 # %%
 target, depth, gbuffers, cameras = relight_scenes.new_view((240, 320), 4)
-found, coverage = relight.synthesize(gbuffers, cameras, target, depth=depth)
-filled, count = relight.fill_holes(found, coverage)
+found, views = relight.synthesize(gbuffers, cameras, target, depth=depth)
+filled, count = relight.fill_holes(found, views)
 truth = scene.gbuffer(mesh, target, **SIZE)
 lights = scene.default_lights(target)
 image, filled_image, true_image = (
@@ -213,7 +213,7 @@ image, filled_image, true_image = (
 )
 pictures(
     {
-        "how many caches see it": coverage,
+        "how many caches see it": views,
         f"{int(count)} pixels of holes": image,
         f"filled: {float(metrics.psnr(filled_image, true_image)):.1f} dB": filled_image,
         "its error, 4 times": 4 * jnp.abs(filled_image - true_image),
@@ -257,16 +257,16 @@ targets = [orbit(degrees, 0.05) for degrees in angles]
 truths = [scene.gbuffer(mesh, target, **small_size) for target in targets]
 
 
-def scores(gbuffers, cameras, weights="equal"):
+def scores(gbuffers, cameras, weighting="equal"):
     """PSNR of the relit picture and the share of the view that is seen, at each angle."""
     for target, truth in zip(targets, truths, strict=True):
-        found, coverage = relight.synthesize(
-            gbuffers, cameras, target, depth=truth.depth, weights=weights
+        found, views = relight.synthesize(
+            gbuffers, cameras, target, depth=truth.depth, weighting=weighting
         )
-        filled, _ = relight.fill_holes(found, coverage)
+        filled, _ = relight.fill_holes(found, views)
         lights = scene.default_lights(target)
         pair = (relight.render(each, target, lights) for each in (filled, truth))
-        seen = jnp.mean(coverage > 0) / jnp.mean(truth.shader >= 0)
+        seen = jnp.mean(views > 0) / jnp.mean(truth.shader >= 0)
         yield float(metrics.psnr(*pair)), float(seen)
 
 
@@ -278,10 +278,10 @@ for name, places in stations.items():
         score, seen = zip(*scores(gbuffers[:number], cameras[:number]), strict=True)
         axes[0].plot(angles, score, ".-", label=f"{number}")
         axes[1].plot(angles, seen, ".-", label=f"{number}")
-    for weights, style in (("equal", ".-"), ("detail", "x:")):
-        score, _ = zip(*scores(gbuffers[:4], cameras[:4], weights), strict=True)
+    for weighting, style in (("equal", ".-"), ("detail", "x:")):
+        score, _ = zip(*scores(gbuffers[:4], cameras[:4], weighting), strict=True)
         color = "C2" if name == "alike" else "C4"
-        axes[2].plot(angles, score, style, color=color, label=f"{name}, {weights}")
+        axes[2].plot(angles, score, style, color=color, label=f"{name}, {weighting}")
 axes[0].set(xlabel="degrees from the nearest cache", ylabel="PSNR of the relit picture, dB")
 axes[1].set(xlabel="degrees from the nearest cache", ylabel="share of the view that is seen")
 axes[2].set(xlabel="degrees from the nearest cache", ylabel="PSNR from 4 caches, dB")
@@ -366,7 +366,7 @@ positions = bounce_camera.points(jnp.where(shown, bounce_cache.depth, 1))
 reached = lambda points: scene.visible(mesh, points, lamp.position)
 straight = relight.shade(bounce_cache, bounce_camera, lamp, reached(positions))
 lit = [reached(transfer.position)]
-bounced = relight.indirect(bounce_cache, transfer, [lamp], lit=lit)
+bounced = relight.indirect(bounce_cache, transfer, [lamp], visibilities=lit)
 pictures(
     {
         "direct": straight,

@@ -74,7 +74,7 @@ SIZE = 7
 bias = {"bias": 0.005, "slope_bias": SIZE / 2}
 hard, full = shadow.hard(*data, **bias), shadow.pcf(*data, size=SIZE, **bias)
 edges, dilated = (
-    shadow.candidates(*data, size=SIZE, mask="screen", dilation=d, **bias).where
+    shadow.candidates(*data, size=SIZE, edges="screen", dilation=d, **bias).where
     for d in (1, SIZE // 2 + 1)
 )
 exact = shadow.candidates(*data, size=SIZE, **bias)
@@ -85,18 +85,18 @@ pictures(
             shadow.prefiltered(*data, size=SIZE, **bias)
         ),
         "compared, then filtered: PCF": shaded(full),
-        'mask="screen", its edges': shaded(hard, edges),
+        'edges="screen", its edges': shaded(hard, edges),
         f"dilated by {SIZE // 2 + 1}": shaded(hard, dilated),
-        'mask="depth"': shaded(hard, exact.where),
+        'edges="depth"': shaded(hard, exact.where),
     },
     3,
 )
 
 # %% [markdown]
-# - `mask="depth"`, the default, asks the smallest and the largest texel under the filter, a
+# - `edges="depth"`, the default, asks the smallest and the largest texel under the filter, a
 #   running minimum and maximum of the map. If both say the same, all do. It can't miss: the
 #   result is `pcf`'s to the last bit.
-# - `mask="screen"` (Yu & Choi) filters near the edges of the hard shadow.
+# - `edges="screen"` (Yu & Choi) filters near the edges of the hard shadow.
 #
 # Of $I$ pixels $B$ are filtered: $I + BF$ comparisons instead of $IF$, $F = n^2$; the mask by
 # depth makes $I$ more.
@@ -251,7 +251,7 @@ for magnification in (0.25, 0.5, 1, 2, 4, 8):
     case = shadow_scenes.plate(magnification, 4)
     sharp, soft = shadow.hard(*case), shadow.pcf(*case, size=SIZE)
     soft_pixels = np.asarray(soft != sharp)
-    found = (shadow.candidates(*case, size=SIZE, mask="screen", dilation=r) for r in reaches)
+    found = (shadow.candidates(*case, size=SIZE, edges="screen", dilation=r) for r in reaches)
     missed = [np.mean(~np.asarray(each.where)[soft_pixels]) for each in found]
     ax.semilogx(reaches, missed, ".-", label=f"{magnification}")
 ax.set(xlabel="dilation, pixels", ylabel="share missed")
@@ -276,8 +276,8 @@ pictures(
     {
         "one comparison": shadow.hard(far, seen),
         "pcf 7 x 7": shadow.pcf(far, seen, size=SIZE),
-        'mask="screen"': shadow.edge_pcf(far, seen, size=SIZE, mask="screen", dilation=1),
-        'mask="depth"': shadow.edge_pcf(far, seen, size=SIZE),
+        'edges="screen"': shadow.edge_pcf(far, seen, size=SIZE, edges="screen", dilation=1),
+        'edges="depth"': shadow.edge_pcf(far, seen, size=SIZE),
     },
     4,
     cmap="gray",

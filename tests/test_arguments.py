@@ -85,7 +85,7 @@ SHADOWED = {"shadow_map": MAP, "receivers": SEEN, "bias": 0.1, "slope_bias": 0.1
 CALLS = {
     "blur.gaussian": (blur.gaussian, {"image": IMAGE, "taps": 3, "passes": 1, "sigma": 0.7}),
     "blur.downsample": (blur.downsample, {"image": IMAGE, "taps": 2}),
-    "blur.linear_taps": (blur.linear_taps, {"weights": np.ones(5)}),
+    "blur.linear_taps": (blur.linear_taps, {"tap_weights": np.ones(5)}),
     "blur.binomial_weights": (blur.binomial_weights, {"taps": 3, "row": 4}),
     "metrics.psnr": (metrics.psnr, {"image": IMAGE, "reference": IMAGE / 2, "data_range": 1.0}),
     "metrics.ssim": (metrics.ssim, {"image": IMAGE, "reference": IMAGE / 2, "data_range": 1.0}),
@@ -126,18 +126,18 @@ CALLS = {
     ),
     "shadow.light_cameras": (
         shadow.light_cameras,
-        {"light": LIGHT, "map_size": 8, "centre": np.zeros(3), "radius": 2.0, "margin": 1},
+        {"light": LIGHT, "map_size": 8, "center": np.zeros(3), "radius": 2.0, "margin": 1},
     ),
     "shadow.hard": (shadow.hard, SHADOWED),
     "shadow.prefiltered": (shadow.prefiltered, SHADOWED | {"size": 3}),
     "shadow.pcf": (shadow.pcf, SHADOWED | {"size": 3, "softness": 0.1}),
     "shadow.edge_pcf": (
         shadow.edge_pcf,
-        SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2, "mask": "screen"},
+        SHADOWED | {"size": 3, "softness": 0.1, "dilation": 2, "edges": "screen"},
     ),
     "shadow.candidates": (
         shadow.candidates,
-        SHADOWED | {"size": 3, "dilation": 2, "mask": "screen"},
+        SHADOWED | {"size": 3, "dilation": 2, "edges": "screen"},
     ),
     "shadow.pcss": (
         shadow.pcss,
@@ -174,8 +174,8 @@ CALLS = {
             **{"tolerance": 0.1, "angle": 0.5},
         },
     ),
-    "relight.best_caches": (
-        relight.best_caches,
+    "relight.choose": (
+        relight.choose,
         {
             **{"gbuffers": [CACHE], "cameras": [CAMERA], "target": CAMERA, "depth": DEPTH},
             **{"count": 1, "tolerance": 0.1, "stride": 2},
@@ -183,11 +183,16 @@ CALLS = {
     ),
     "relight.fill_holes": (
         relight.fill_holes,
-        {"gbuffer": CACHE, "coverage": np.ones(SIZE, int)},
+        {"gbuffer": CACHE, "views": np.ones(SIZE, int)},
     ),
     "relight.indirect": (
         relight.indirect,
-        {"gbuffer": CACHE, "transfer": TRANSFER, "lights": [LIGHT], "lit": [np.ones(5)]},
+        {
+            "gbuffer": CACHE,
+            "transfer": TRANSFER,
+            "lights": [LIGHT],
+            "visibilities": [np.ones(5)],
+        },
     ),
     "relight.capture_normals": (
         lambda render: inspect.unwrap(relight.capture_normals)(lambda lights: render),
@@ -505,8 +510,8 @@ def test_check_camera_and_check_light():
 def test_no_function_is_forgotten():
     """Every public function of arrays, and every type of ours, has its good call."""
     host = {"scene", "exr", "io", "tradeoff"}
-    records = {"Plan", "Accumulation", "Choice", "Hit", "Receivers", "Candidates", "Lens"}
-    records |= {"Filled", "Projection", "Rays"}
+    records = {"Plan", "Accumulation", "Choice", "Synthesis", "Hit", "Receivers", "Candidates"}
+    records |= {"Lens", "Filled", "Projection", "Rays"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -318,7 +318,7 @@ def test_faults_are_named():
         inspect.unwrap(blur.binomial_weights)(9, row=7)
     with pytest.raises(ValueError, match=r"`binomial_weights\(taps=...\)` must be a positive"):
         inspect.unwrap(blur.binomial_weights)(0, row=7)
-    with pytest.raises(ValueError, match=r"`linear_taps\(weights\)` must be 0 or positive"):
+    with pytest.raises(ValueError, match=r"`linear_taps\(tap_weights\)` must be 0 or positive"):
         inspect.unwrap(blur.linear_taps)(np.array([1.0, -1.0]))
-    with pytest.raises(ValueError, match=r"`linear_taps\(weights\)` must be a vector"):
+    with pytest.raises(ValueError, match=r"`linear_taps\(tap_weights\)` must be a vector"):
         inspect.unwrap(blur.linear_taps)(np.ones((2, 2)))

@@ -22,11 +22,11 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
 NUMERICS = {
-    "_arrays",
-    *("_checks", "_extras", "_filter", "_holes", "_linear", "_numerics", "_platform"),
+    *("_arrays", "_checks", "_choice", "_extras", "_filter", "_holes", "_linear", "_numerics"),
+    "_platform",
     *("_progress", "_pyramid", "_sampling", "_tiles"),
 }
-TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light"}
+TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "transfer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}
@@ -45,11 +45,11 @@ LAZY_LIBRARIES = {"embreex", "matplotlib", "OpenEXR", "OpenGL", "PIL", "pyrender
 
 # What may be given by position, in the order in which it is given.
 DATA = (
-    *("render", "taps", "weights"),
+    *("render", "taps", "tap_weights"),
     *("image", "images", "shadow_map", "gbuffer", "gbuffers"),
     *("transfer", "depth", "depths"),
     *("camera", "cameras", "receivers", "lens", "source", "sources", "target"),
-    *("origin", "direction", "light", "lights", "light_camera", "visibility", "coverage"),
+    *("origin", "direction", "light", "lights", "light_camera", "visibility", "views"),
 )
 
 ARRAY = re.compile(r"\b(Float|Int|Bool|Num|Shaped)\[|ArrayLike|\bAny\b|\bArray\b")

@@ -41,7 +41,11 @@ HANDED_ON = {
 }
 
 # Options that a traced argument needs: the default serves concrete ones alone.
-NEEDED = {("blur.gaussian", "taps"): 9}
+NEEDED = {
+    ("blur.gaussian", "taps"): 9,
+    # One per point of the transfer, not per pixel.
+    ("relight.indirect", "visibilities"): lambda rng, size: [None, rng.uniform(0, 1, 5)],
+}
 
 # Searches that end off the surface whose derivative they take: it is not that of their error.
 ROUGH = {"descent", "linear", "relief"}
@@ -138,7 +142,6 @@ EXAMPLES = {
     "mask": [lambda rng, size: np.ones(size, bool)],
     "gbuffer": [gbuffer],
     "transfer": [transfer],
-    "lit": [lambda rng, size: [None, rng.uniform(0, 1, 5)]],
     "shadow_map": [lambda rng, size: rng.uniform(1.1, 4, size)],
     "receivers": [receivers],
     "light_camera": [orthographic, pinhole],
@@ -163,7 +166,7 @@ EXAMPLES = {
     "lights": [lambda rng, size: [make(rng, size) for make in (ambient, point)]],
     "gbuffers": [lambda rng, size: [gbuffer(rng, size), gbuffer(rng, size)]],
     "cameras": [lambda rng, size: [pinhole(rng, size), orthographic(rng, size)]],
-    "coverage": [lambda rng, size: rng.integers(0, 2, size)],
+    "views": [lambda rng, size: rng.integers(0, 2, size)],
     "visibilities": [lambda rng, size: [None, rng.uniform(0, 1, size)]],
     "count": [lambda rng, size: 2],
     "gamma": [lambda rng, size: np.array(rng.uniform(1, 2))],
@@ -171,7 +174,7 @@ EXAMPLES = {
     "data_range": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "max_coc": [lambda rng, size: 6.0],
     "sigma": [lambda rng, size: np.array(rng.uniform(1, 2))],
-    "weights": [lambda rng, size: rng.uniform(0.1, 1, 5)],
+    "tap_weights": [lambda rng, size: rng.uniform(0.1, 1, 5)],
     "slices": [lambda rng, size: 3, lambda rng, size: "all"],
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],
@@ -192,7 +195,7 @@ REFUSED = {
         chosen["coverage"] == "indicator" and chosen["kernel"] != "segment_sum"
     ),
     "shadow.edge_pcf": lambda chosen: (
-        chosen["dilation"] is not EXAMPLES["dilation"][chosen["mask"] == "screen"]
+        chosen["dilation"] is not EXAMPLES["dilation"][chosen["edges"] == "screen"]
     ),
 }
 

@@ -36,7 +36,7 @@ def lambert(mesh, camera, size):
 
 def shadow_of(mesh, gbuffer, camera, light, map_size=1024):
     """The light's visibility by shadow maps, unfiltered."""
-    ball = {"centre": mesh.center, "radius": mesh.radius}
+    ball = {"center": mesh.center, "radius": mesh.radius}
     cameras = shadow.light_cameras(light, map_size=map_size, **ball)
     take = functools.partial(scene.depth, mesh, height=map_size, width=map_size)
     maps = [take(each, backend="embree") for each in cameras]

@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int, Num
 from jaxfx._checks import Number, WholeNumber, parameter
 from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
-from jaxfx.shadow import _taps
+from jaxfx.shadow.arguments import filter_arguments
+from jaxfx.shadow.compare import mean_comparison, set_up
 from jaxfx.shadow.edge import candidates, edge_pcf
-from jaxfx.shadow.pcf import average, pcf
+from jaxfx.shadow.pcf import pcf
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -47,10 +48,10 @@ class Filter(eqx.Module):
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
         """As the effect."""
         data = (shadow_map, receivers, self.bias, self.slope_bias)
-        *data, bias, slope_bias, _ = _taps.checked("shadow", *data, size=self.full_size)
+        *data, bias, slope_bias, _ = filter_arguments("shadow", *data, size=self.full_size)
         how = {"size": self.size, "bias": bias, "slope_bias": slope_bias}
         if self.masked and self.size > 1:
-            return edge_pcf(*data, mask="depth", **how)
+            return edge_pcf(*data, edges="depth", **how)
         return pcf(*data, **how)
 
 
@@ -66,15 +67,15 @@ class Picked(eqx.Module):
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
         """As the effect."""
         data = (shadow_map, receivers, self.bias, self.slope_bias)
-        data = _taps.checked("shadow", *data, size=self.size)
+        data = filter_arguments("shadow", *data, size=self.size)
         return _picked(self.size, self.pixels, *data[:4])
 
 
 @ft.partial(jax.jit, static_argnums=0)
 def _picked(size, pixels, shadow_map, receivers, bias, slope_bias):
     texels, places, some = _at(size, pixels, shadow_map, receivers, bias, slope_bias)
-    soft = average(texels, some, None, size, "box")
-    result = average(texels, places, None, 1, "box").reshape(-1)
+    soft = mean_comparison(texels, some, None, size, "box")
+    result = mean_comparison(texels, places, None, 1, "box").reshape(-1)
     result = result.at[pixels].set(soft, mode="drop").reshape(receivers.z.shape)
     return jax.lax.stop_gradient(result).astype(receivers.z.dtype)
 
@@ -83,15 +84,13 @@ def _picked(size, pixels, shadow_map, receivers, bias, slope_bias):
 def _squares(size, pixels, *data):
     """The mean squared errors of all smaller filters in some pixels, from size 1 on."""
     texels, _, some = _at(size, pixels, *data)
-    *less, full = (average(texels, some, None, n, "box") for n in range(1, size + 1, 2))
+    *less, full = (mean_comparison(texels, some, None, n, "box") for n in range(1, size + 1, 2))
     return [jnp.mean((each - full) ** 2) for each in less]
 
 
 def _at(size, pixels, shadow_map, receivers, bias, slope_bias):
     """What is compared: the map, the places of all pixels, and those of some."""
-    dtype = _taps.common_dtype(shadow_map, receivers)
-    texels = _taps.pad_map(shadow_map, size, dtype)
-    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
+    texels, places = set_up(shadow_map, receivers, bias, slope_bias, size)
     some = jax.tree.map(lambda x: x.reshape(-1).at[pixels].get(mode="clip"), places)
     return texels, places, some
 
@@ -131,7 +130,9 @@ def shadow(
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    shadow_map = _taps.checked("shadow", shadow_map, receivers, bias, slope_bias, size=size)[0]
+    shadow_map = filter_arguments("shadow", shadow_map, receivers, bias, slope_bias, size=size)[
+        0
+    ]
     given = lambda name, each: None if each is None else parameter(f"shadow({name}=...)", each)
     biases, size = (given("bias", bias), given("slope_bias", slope_bias)), int(size)
     where = candidates(
@@ -157,7 +158,7 @@ def shadow(
     # Filters differ inside the mask alone, and so by how much can be told from some of it.
     inside = np.flatnonzero(where)
     inside = inside[np.linspace(0, inside.size - 1, min(_SOME, where.size)).astype(int)]
-    probed = _taps.checked("shadow", *data, *biases, size=size)[:4]
+    probed = filter_arguments("shadow", *data, *biases, size=size)[:4]
     for smaller, square in zip(range(1, size, 2), _squares(size, inside, *probed), strict=True):
         less = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
         if (square := share * float(square)) > max_error**2:

@@ -19,18 +19,18 @@ _Numbers = Int[Array, "height width"]
 
 
 def fill_holes(
-    gbuffer: GBuffer, coverage: Int[ArrayLike, "height width"]
+    gbuffer: GBuffer, views: Int[ArrayLike, "height width"]
 ) -> tuple[GBuffer, Int[Array, ""]]:
     """What `synthesize` left open, taken from the nearest pixel that a cache covers.
 
     Pixels without a depth (inf, or missing: 0, negative, NaN) stay as they are.
 
-    **Arguments:** `gbuffer`, `coverage`: height width, both from `synthesize`.
+    **Arguments:** `gbuffer`, `views`: height width, integers; both from `synthesize`.
 
     **Returns:** the `GBuffer`, which keeps its depth; and the number of pixels filled, an
     integer. Where no pixel at all is covered, nothing is filled and the number is 0.
 
-    **Raises:** `ValueError` for a `coverage` of another shape.
+    **Raises:** `ValueError` for a `views` of another shape.
 
     **Gradient:** exact: a filled pixel's is that of the one that it was taken from.
 
@@ -38,18 +38,18 @@ def fill_holes(
     Saito & Toriwaki 1994, columns first.
     """
     gbuffer = check_gbuffer("fill_holes(gbuffer)", gbuffer)
-    coverage = as_array("fill_holes(coverage)", coverage)
-    if coverage.shape != gbuffer.depth.shape:
+    views = as_array("fill_holes(views)", views)
+    if views.shape != gbuffer.depth.shape:
         raise ValueError(
-            f"`fill_holes(coverage)` must have the cache's height and width "
-            f"{gbuffer.depth.shape}, got {coverage.shape}."
+            f"`fill_holes(views)` must have the cache's height and width "
+            f"{gbuffer.depth.shape}, got {views.shape}."
         )
-    return _fill(gbuffer, coverage)
+    return _fill(gbuffer, views)
 
 
 @jax.jit
-def _fill(gbuffer, coverage):
-    covered = coverage > 0
+def _fill(gbuffer, views):
+    covered = views > 0
     hole = ~covered & jnp.isfinite(gbuffer.depth) & (gbuffer.depth > 0)
     found, near = _nearest(covered, hole)
     hole &= found

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from jaxfx._arguments import check_gbuffer, check_lights
 from jaxfx._checks import shares
 from jaxfx._numerics import working_dtype
-from jaxfx.gbuffer import GBuffer, Transfer
+from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight.shading import Surface, check_shader, received
+from jaxfx.transfer import Transfer
 
 
 def indirect(
@@ -20,7 +21,7 @@ def indirect(
     transfer: Transfer,
     lights: Sequence[Light],
     *,
-    lit: Sequence[Any] | None = None,
+    visibilities: Sequence[Any] | None = None,
 ) -> Float[Array, "height width 3"]:
     """The picture of what diffuse surfaces send on to one another, once: add it to `render`'s.
 
@@ -37,17 +38,19 @@ def indirect(
     - `transfer`: from `scene.transfer`, of this cache.
     - `lights`: a sequence of lights of any kinds. Ambient ones stand for indirect light
       themselves, and bring nothing here.
-    - `lit`: for each light, a number in [0, 1] or a boolean for each point, how much of the
-      light gets there, or None for all of it. `scene.visible(mesh, transfer.position,
-      light.position)` tells. None alone stands for no shadows at all.
+    - `visibilities`: one per light: for each point of `transfer` a number in [0, 1] or a
+      boolean, the share of the light that arrives, or None for all of it. For a point light,
+      `scene.visible(mesh, transfer.position, light.position)` computes it. None alone stands
+      for no shadows at all.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`; 0 where the
     shader is -1.
 
-    **Raises:** `ValueError` for another size, an unknown light, or a `lit` that does not fit.
+    **Raises:** `ValueError` for another size, an unknown light, or `visibilities` that do not
+    fit.
 
     **Gradient:** exact with respect to `gbuffer.diffuse`, every field of `transfer`, the lights
-    and `lit`, as `shade`'s; zero with respect to the cache's other images.
+    and `visibilities`, as `shade`'s; zero with respect to the cache's other images.
 
     Source: Hasan, Pellacini & Bala 2006, equation 3.
     """
@@ -63,17 +66,19 @@ def indirect(
             f"`indirect(transfer)` must be of the cache's height and width "
             f"{gbuffer.depth.shape}, got {shape}."
         )
-    lit = shares("indirect(lit=...)", lit, len(lights), (len(transfer.position),))
-    return _indirect(gbuffer, transfer, lights, lit)
+    visibilities = shares(
+        "indirect(visibilities=...)", visibilities, len(lights), (len(transfer.position),)
+    )
+    return _indirect(gbuffer, transfer, lights, visibilities)
 
 
 @jax.jit
-def _indirect(gbuffer, transfer, lights, lit):
+def _indirect(gbuffer, transfer, lights, visibilities):
     dtype = working_dtype(gbuffer.color.dtype)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     surface = _points(transfer)
     arriving = jnp.zeros_like(transfer.diffuse)
-    for light, part in zip(lights, lit, strict=True):
+    for light, part in zip(lights, visibilities, strict=True):
         if not isinstance(light, AmbientLight):
             brought = received(surface, light)[0][0]
             arriving += brought if part is None else part.astype(dtype)[:, None] * brought

@@ -1,43 +1,46 @@
-"""The deep frame buffer of a new camera, from those of other cameras.
-
-Every pixel of the new view is a point of the world, its depth given. The point is looked up in
-each cache; what the caches that see it say of it is averaged. A point that none sees is a hole.
-
-It does badly where the caches are coarse: they are read at the nearest pixel, so that texture
-finer than a cache's pixels aliases, and what two surfaces less than `tolerance` apart show is
-told apart only by shader, normal and the fit to each cache's own surface.
-"""
+"""The deep frame buffer of a new camera, from those of other cameras."""
 
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, Num
 
-from jaxfx._arguments import check_camera, check_gbuffer
-from jaxfx._checks import (
-    Number,
-    WholeNumber,
-    check_depth,
-    check_map,
-    items,
-    number,
-    option,
-    whole_number,
-)
-from jaxfx._numerics import normalize, safe_divide
+from jaxfx._checks import Number, number, option
+from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
+from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.relight._views import Found, Scalars, look_up, points
+from jaxfx.relight._new_view import (
+    CacheSamples,
+    check_caches,
+    check_new_depth,
+    look_up,
+    points,
+)
 
 
 _AVERAGED = ("color", "ambient", "diffuse", "specular", "roughness")
-_WORSE = 0.1  # tolerances; a cache that fits a point worse than the best by this shows another
+# In tolerances. A cache whose surface is farther from the point than the nearest cache's by
+# more than this shows another surface and is left out. Larger values blur two close surfaces
+# into one; 0 would leave one cache per pixel, and rounding would decide which.
+_LARGEST_EXCESS = 0.1
+
+
+class Synthesis(NamedTuple):
+    """A synthesized cache, and how many caches each of its pixels comes from.
+
+    - `gbuffer`: the `GBuffer` of the new camera, height width.
+    - `views`: height width, integers: how many caches show the pixel's point. Where it is 0 and
+      the depth is known, the pixel is a hole: see `fill_holes`.
+    """
+
+    gbuffer: GBuffer
+    views: Int[Array, "height width"]
 
 
 def synthesize(
@@ -48,32 +51,27 @@ def synthesize(
     depth: Num[ArrayLike, "height width"],
     tolerance: Number = 0.005,
     angle: Number = 0.5,
-    weights: Literal["equal", "detail"] = "equal",
-) -> tuple[GBuffer, Int[Array, "height width"]]:
-    """The cache of the camera `target`, and how many caches each of its pixels comes from.
+    weighting: Literal["equal", "detail"] = "equal",
+) -> Synthesis:
+    """The cache of the camera `target`, made from the caches of other cameras.
 
-    A cache sees a pixel's point if the surface in the cache's own pixel passes through it: if
-    their distance, across the surface, is at most `tolerance` of the depth, and if the surface
-    faces the new camera. The cache with the least distance decides the shader; of the others,
-    those count that have that shader, a normal within `angle` of its normal, and a distance not
-    larger by more than a tenth of the tolerance.
+    Relight it as any cache, without rendering the scene again. What no cache sees stays open;
+    `fill_holes` fills it.
 
     **Arguments:**
 
     - `gbuffers`, `cameras`: the caches, height width each, of any sizes, and their cameras.
     - `target`: the new camera.
     - `depth`: height width, of the new view, scene units along its axis, inf for background; 0,
-      negative or NaN where it is missing: from the mesh, or from the caches' own depths,
-      warped.
-    - `tolerance`: static; of the depth. It must cover the error of the depths.
-    - `angle`: static; radians.
-    - `weights`: "equal" is the source's mean; "detail" favours the nearer and more frontal
-      camera, by the pixels that it spends on a unit of the surface.
+      negative or NaN where it is missing. Take it from the mesh, or warp the caches' depths.
+    - `tolerance`: static; a ratio of the depth. It must cover the error of the depths.
+    - `angle`: static; radians. Caches whose normals differ by more are not averaged.
+    - `weighting`: "equal" is the source's mean; "detail" weighs each cache by the pixels that
+      it spends on a unit of the surface, which favours near and frontal cameras.
 
-    **Returns:** the `GBuffer`, its normals averaged on the sphere, its depth the one given; and
-    the coverage, height width, integers. A pixel of known depth with coverage 0 is a hole: see
-    `fill_holes`. Holes and background have shader -1 and zeros. A NaN in a cache reaches only
-    the pixels that read it.
+    **Returns:** a `Synthesis` of `gbuffer` and `views`. Normals are averaged on the sphere; the
+    depth is the given one. Holes and background have shader -1 and zeros. A NaN in a cache
+    reaches only the pixels that read it.
 
     **Raises:** `ValueError` where there is no cache, or not one camera for each, or for an
     option out of range.
@@ -82,169 +80,103 @@ def synthesize(
     is passed on. With respect to the normals and the cameras, exact for the weights; zero for
     what is visible, and zero along the image, for caches are read at the nearest pixel.
 
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import GBuffer, PinholeCamera, relight
+    >>> view = {"up": [0, -1, 0], "fov_y": 0.7, "height": 8, "width": 8}
+    >>> old = PinholeCamera.look_at([0, 0, 0], [0, 0, 3], **view)
+    >>> new = PinholeCamera.look_at([1, 0, 0], [1, 0, 3], **view)
+    >>> ones = jnp.ones((8, 8, 3))
+    >>> facing = -ones.at[..., :2].set(0)
+    >>> shader, depth = jnp.zeros((8, 8), int), jnp.full((8, 8), 3.0)
+    >>> cache = GBuffer(ones, shader, ones, ones, ones, facing, depth, depth / 6)
+    >>> gbuffer, views = relight.synthesize([cache], [old], new, depth=depth)
+    >>> gbuffer.color.shape, float(views.mean())
+    ((8, 8, 3), 0.5)
+
+    Every pixel of the new view is a point in world space. A cache sees it if the surface in the
+    cache's own pixel passes through it (their distance, across the surface, is at most
+    `tolerance` of the depth) and faces the new camera. The cache with the least distance
+    decides the shader; of the others, those are averaged that have that shader, a normal within
+    `angle` of its normal, and a distance not larger by more than a tenth of the tolerance.
+
+    It does badly where the caches are coarse: they are read at the nearest pixel, so texture
+    finer than a cache's pixels aliases, and two surfaces less than `tolerance` apart are told
+    apart only by shader, normal and the distance to each cache's own surface.
+
     Source: Kim, Lee & Kyung, equations 2 and 3. The tests across the surface, of normal and of
     shader, and the weights, are our own.
     """
-    caches = _check("synthesize", gbuffers, cameras, target)
+    caches = check_caches("synthesize", gbuffers, cameras, target)
     tolerance = number("synthesize(tolerance=...)", tolerance)
     angle = number("synthesize(angle=...)", angle, expected="positive, in radians,")
-    option("synthesize(weights=...)", weights, ("equal", "detail"))
-    depth = _check_target("synthesize", depth)
-    options = {"tolerance": tolerance, "angle": angle, "weights": weights}
+    option("synthesize(weighting=...)", weighting, ("equal", "detail"))
+    depth = check_new_depth("synthesize", depth)
+    options = {"tolerance": tolerance, "angle": angle, "weighting": weighting}
     return _synthesize(*caches, target, depth, **options)
 
 
-def best_caches(
-    gbuffers: Sequence[GBuffer],
-    cameras: Sequence[PinholeCamera | OrthographicCamera],
-    target: PinholeCamera | OrthographicCamera,
-    *,
-    depth: Num[ArrayLike, "height width"],
-    count: WholeNumber,
-    tolerance: Number = 0.005,
-    stride: WholeNumber = 8,
-) -> Int[Array, " count"]:
-    """Which caches serve a new view best: the one that sees most of it, and so on.
-
-    Each next one is that which adds most to those before it, measured by what of the view they
-    see and in how much detail. It is found on every `stride`-th pixel.
-
-    **Arguments:**
-
-    - `gbuffers`, `cameras`, `target`, `depth`, `tolerance`: as in `synthesize`.
-    - `count`: static; how many, from 1.
-    - `stride`: static; pixels.
-
-    **Returns:** `count` indices, the best first.
-
-    **Raises:** `ValueError` as `synthesize`, and for a `count` or `stride` out of range.
-
-    **Gradient:** none: these are integers.
-
-    Source: our own; the greedy choice is within 1 - 1/e of the best (Nemhauser, Wolsey &
-    Fisher 1978).
-    """
-    caches = _check("best_caches", gbuffers, cameras, target)
-    most = len(caches[0])
-    in_range = lambda n: 1 <= n <= most
-    count = whole_number("best_caches(count=...)", count, in_range, f"in [1, {most}]")
-    stride = whole_number("best_caches(stride=...)", stride, expected="at least 1")
-    tolerance = number("best_caches(tolerance=...)", tolerance)
-    depth = _check_target("best_caches", depth)
-    options = {"count": count, "tolerance": tolerance, "stride": stride}
-    return _best_caches(*caches, target, depth, **options)
-
-
-@partial(jax.jit, static_argnames=("count", "tolerance", "stride"))
-def _best_caches(gbuffers, cameras, target, depth, *, count, tolerance, stride):
-    rows, columns = (slice(min(stride, side) // 2, None, stride) for side in depth.shape)
-    pixels = pixel_centers(depth.shape[0], depth.shape[1], depth.dtype)[rows, columns]
-    point = points(target, pixels, depth[rows, columns])
-    found = [
-        look_up(gbuffer, camera, point, tolerance)
-        for gbuffer, camera in zip(gbuffers, cameras, strict=True)
-    ]
-    detail = jnp.stack([jnp.where(one.seen & point.known, one.detail, 0) for one in found])
-    most = jnp.max(detail, axis=0, keepdims=True)
-    detail = safe_divide(detail, jnp.broadcast_to(most, detail.shape))
-    # A cache that sees a point is worth most of it; the most detailed one, all of it.
-    worth = jnp.where(detail > 0, (3 + detail) / 4, 0)
-    have, taken, chosen = jnp.zeros_like(worth[0]), jnp.zeros(len(found), bool), []
-    for _ in range(count):
-        gain = jnp.sum(jnp.maximum(worth - have[None], 0), axis=(1, 2))
-        index = jnp.argmax(jnp.where(taken, -1, gain)).astype(jnp.int32)
-        have, taken = jnp.maximum(have, worth[index]), taken.at[index].set(True)
-        chosen.append(index)
-    return jnp.stack(chosen)
-
-
-def _check(
-    caller: str, gbuffers: Any, cameras: Any, target: Any
-) -> tuple[tuple[GBuffer, ...], tuple[Camera, ...]]:
-    gbuffers = items(f"{caller}(gbuffers)", gbuffers)
-    cameras = items(f"{caller}(cameras)", cameras)
-    for name, values in (("gbuffers", gbuffers), ("cameras", cameras)):
-        if not values:
-            raise ValueError(
-                f"`{caller}({name})` must be a sequence of at least one, got none."
-            )
-    gbuffers = [
-        check_gbuffer(f"{caller}(gbuffers[{i}])", each) for i, each in enumerate(gbuffers)
-    ]
-    for index, camera in enumerate(cameras):
-        check_camera(f"{caller}(cameras[{index}])", camera)
-    check_camera(f"{caller}(target)", target)
-    if len(gbuffers) != len(cameras):
-        raise ValueError(
-            f"`{caller}(cameras)` must be one for each cache, got {len(cameras)} for "
-            f"{len(gbuffers)}."
-        )
-    return tuple(gbuffers), tuple(cameras)
-
-
-def _check_target(caller: str, depth: Any) -> Scalars:
-    depth = check_map(f"{caller}(depth=...)", depth)
-    return check_depth(f"{caller}(depth=...)", depth, depth.shape)
-
-
-@partial(jax.jit, static_argnames=("tolerance", "angle", "weights"))
-def _synthesize(gbuffers, cameras, target, depth, *, tolerance, angle, weights):
+@partial(jax.jit, static_argnames=("tolerance", "angle", "weighting"))
+def _synthesize(gbuffers, cameras, target, depth, *, tolerance, angle, weighting):
     like = gbuffers[0].depth.dtype
     height, width = depth.shape
     point = points(target, pixel_centers(height, width, depth.dtype), depth)
-    found = [
+    samples = [
         look_up(gbuffer, camera, point, tolerance)
         for gbuffer, camera in zip(gbuffers, cameras, strict=True)
     ]
-    counted, shader = _agreement(found, tolerance, angle)
-    counted = [each & point.known for each in counted]
-    coverage = sum(each.astype(jnp.int32) for each in counted)
-    covered = coverage > 0
-    shares = [
-        jnp.where(each, one.detail if weights == "detail" else jnp.ones_like(one.detail), 0)
-        for each, one in zip(counted, found, strict=True)
+    agrees, shader = _agreement(samples, tolerance, angle)
+    is_used = [mask & point.is_known for mask in agrees]
+    views = sum(mask.astype(jnp.int32) for mask in is_used)
+    is_covered = views > 0
+    weights = [
+        jnp.where(mask, s.detail if weighting == "detail" else jnp.ones_like(s.detail), 0)
+        for mask, s in zip(is_used, samples, strict=True)
     ]
-    total = jnp.where(covered, sum(shares), 1)
-    shares = [(share / total).astype(like) for share in shares]
+    total = jnp.where(is_covered, sum(weights), 1)
+    weights = [(weight / total).astype(like) for weight in weights]
 
     def mean(values):
-        out = jnp.zeros_like(values[0])
-        for value, part in zip(values, shares, strict=True):
-            share = part.reshape(part.shape + (1,) * (out.ndim - 2))
-            # What has no share may not be finite, nor be multiplied by a derivative's 0.
-            out = out + share * jnp.where(share > 0, value, 0)
-        return out
+        """The weighted mean of one image per cache, height width ..."""
+        result = jnp.zeros_like(values[0])
+        for value, plane in zip(values, weights, strict=True):
+            weight = plane.reshape(plane.shape + (1,) * (result.ndim - 2))
+            # A value of no weight may be NaN or inf; 0 times it is NaN, in a derivative too.
+            result = result + weight * jnp.where(weight > 0, value, 0)
+        return result
 
-    def read(name):
+    def mean_field(name):
         images = (getattr(gbuffer, name).astype(like) for gbuffer in gbuffers)
-        return mean([one.read(image) for one, image in zip(found, images, strict=True)])
+        return mean([s.read(image) for s, image in zip(samples, images, strict=True)])
 
     gbuffer = GBuffer(
-        shader=jnp.where(covered, shader, -1),
-        normal=normalize(mean([one.normal.astype(like) for one in found])),
+        shader=jnp.where(is_covered, shader, -1),
+        normal=normalize(mean([s.normal.astype(like) for s in samples])),
         depth=depth.astype(like),
-        **{name: read(name) for name in _AVERAGED},
+        **{name: mean_field(name) for name in _AVERAGED},
     )
-    return gbuffer, coverage
+    return Synthesis(gbuffer, views)
 
 
 def _agreement(
-    found: Sequence[Found], tolerance: float, angle: float
+    samples: Sequence[CacheSamples], tolerance: float, angle: float
 ) -> tuple[list[Bool[Array, "height width"]], Int[Array, "height width"]]:
-    """Which caches count in each pixel, and the shader there."""
-    apart = [jnp.where(one.seen, one.distance, jnp.inf) for one in found]
-    best, shader, normal = apart[0], found[0].shader, found[0].normal
-    for distance, one in zip(apart[1:], found[1:], strict=True):
-        nearer = distance < best
-        best = jnp.where(nearer, distance, best)
-        shader = jnp.where(nearer, one.shader, shader)
-        normal = jnp.where(nearer[..., None], one.normal, normal)
+    """Where each cache agrees with the one whose surface is nearest; and the shader of that."""
+    distances = [jnp.where(s.is_visible, s.distance, jnp.inf) for s in samples]
+    least, shader, normal = distances[0], samples[0].shader, samples[0].normal
+    for distance, s in zip(distances[1:], samples[1:], strict=True):
+        is_nearer = distance < least
+        least = jnp.where(is_nearer, distance, least)
+        shader = jnp.where(is_nearer, s.shader, shader)
+        normal = jnp.where(is_nearer[..., None], s.normal, normal)
+    # Between unit vectors `angle` apart.
     chord = 2 * math.sin(min(angle, math.pi) / 2)
-    counted = [
-        one.seen
-        & (one.shader == shader)
-        & (jnp.sum((one.normal - normal) ** 2, axis=-1) <= chord**2)
-        & (one.distance <= best + _WORSE * tolerance)
-        for one in found
+    agrees = [
+        s.is_visible
+        & (s.shader == shader)
+        & (jnp.sum((s.normal - normal) ** 2, axis=-1) <= chord**2)
+        & (s.distance <= least + _LARGEST_EXCESS * tolerance)
+        for s in samples
     ]
-    return counted, shader
+    return agrees, shader

@@ -19,10 +19,11 @@ from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_numpy, whole_number
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import Camera
-from jaxfx.gbuffer import GBuffer, Transfer
+from jaxfx.gbuffer import GBuffer
 from jaxfx.scene import embree
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._surface import Hits, at_hits
+from jaxfx.transfer import Transfer
 
 
 # Candidates drawn per sample that is kept. Fewer miss small bright surfaces; more cost rays.

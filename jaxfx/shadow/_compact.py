@@ -1,8 +1,8 @@
-"""Work on some pixels of many: as many as there are, without a capacity that could overflow.
+"""A loop over the pixels of a mask, however many there are: no capacity that could overflow.
 
-The pixels' bits are packed into words, whose counts are summed; then the place of the n-th set
-bit is found by halving, first among the words, then inside one. A loop does the pixels chunk by
-chunk, and ends with the last: where no bit is set, nothing is done.
+The mask's bits are packed into words, whose set bits are counted and summed up. The n-th set
+bit is then found by bisection, first among the words, then inside one. The loop processes
+pixels in chunks and ends after the last: an empty mask costs no iteration.
 """
 
 from collections.abc import Callable
@@ -13,31 +13,35 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 
-_BITS = 32
+_WORD_BITS = 32
+# Pixels per iteration. Larger chunks waste more work on the last one and need more memory;
+# smaller ones pay the loop's overhead more often. Values do not depend on it.
 _CHUNK = 2048
 
 
 def fold(
-    where: Bool[Array, " pixel"],
+    mask: Bool[Array, " pixel"],
     start: Any,
     fetch: Callable[[Int[Array, " chunk"]], Any],
     step: Callable[[Any, Int[Array, " chunk"], Any], Any],
 ) -> Any:
-    """`start` after `step(carry, pixels, fetch(pixels))` for chunk by chunk of what is `where`.
+    """`start` after `carry = step(carry, pixels, fetch(pixels))` for all pixels of the mask.
 
-    In the last chunk pixels past the end stand for none; they are fetched as the last one.
-    What `fetch` gives comes out of a branch, which lays it out in memory: else XLA would fetch
-    it anew for each tap of a filter.
+    `pixels` are the flat indices of a chunk. In the last chunk, indices past the end of the
+    image fill it up; `fetch` gets the last pixel in their place.
+
+    The result of `fetch` is returned by a `lax.cond`, which stores it in memory: otherwise XLA
+    would compute it again for each tap of a filter.
     """
-    words = _pack(where)
+    words = _pack(mask)
     ends = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
-    chunk = min(_CHUNK, where.size)
+    chunk = min(_CHUNK, mask.size)
     steps = (ends[-1] + chunk - 1) // chunk
 
     def load(k):
         rank = k * chunk + jnp.arange(chunk, dtype=jnp.int32)
-        pixels = jnp.where(rank < ends[-1], _nth_set(words, ends, rank), where.size)
-        return pixels, fetch(jnp.minimum(pixels, where.size - 1))
+        pixels = jnp.where(rank < ends[-1], _nth_set(words, ends, rank), mask.size)
+        return pixels, fetch(jnp.minimum(pixels, mask.size - 1))
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(load, steps))
 
@@ -49,15 +53,19 @@ def fold(
 
 
 def _pack(bits: Bool[Array, " pixel"]) -> UInt32[Array, " word"]:
-    padded = jnp.pad(bits, (0, -bits.size % _BITS)).reshape(-1, _BITS)
-    shifts = jnp.arange(_BITS, dtype=jnp.uint32)
+    """The mask's bits, 32 to a word, the first in the lowest place."""
+    padded = jnp.pad(bits, (0, -bits.size % _WORD_BITS)).reshape(-1, _WORD_BITS)
+    shifts = jnp.arange(_WORD_BITS, dtype=jnp.uint32)
     return jnp.sum(padded.astype(jnp.uint32) << shifts[None], axis=1, dtype=jnp.uint32)
 
 
 def _nth_set(
     words: UInt32[Array, " word"], ends: Int[Array, " word"], rank: Int[Array, " chunk"]
 ) -> Int[Array, " chunk"]:
-    """The index of the bit that so many set ones stand before; anything beyond the last."""
+    """The index of the set bit with `rank` set bits before it; past the last, any index.
+
+    `ends` counts the set bits up to the end of each word.
+    """
     at = jnp.minimum(jnp.searchsorted(ends, rank, side="right"), words.size - 1)
     word = words[at]
     rank = rank - (ends[at] - jax.lax.population_count(word).astype(jnp.int32))
@@ -69,4 +77,4 @@ def _nth_set(
         rank = jnp.where(is_above, rank - before, rank)
         word = jnp.where(is_above, word >> half, word)
         bit = jnp.where(is_above, bit + half, bit)
-    return at * _BITS + bit
+    return at * _WORD_BITS + bit

@@ -14,7 +14,7 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.light import AmbientLight, DirectionalLight, Light, SpotLight
 
 
-# The two world axes that a map's rows and columns follow on each face of a cube.
+# Of each face of a cube: the axis that its camera looks along, and its up axis, in world space.
 _FACES = (
     ((1, 0, 0), (0, 1, 0)),
     ((-1, 0, 0), (0, 1, 0)),
@@ -29,37 +29,46 @@ def light_cameras(
     light: Light,
     *,
     map_size: WholeNumber,
-    centre: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    center: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
     radius: Float[ArrayLike, ""] | float = 1.0,
     margin: WholeNumber = 0,
 ) -> tuple[PinholeCamera | OrthographicCamera, ...]:
-    """The cameras that a light's shadow maps are made with.
+    """The cameras to render a light's shadow maps with.
 
-    One for a directional light, orthographic, that takes in a ball about the scene; one for a
-    spot light, as wide as its cone; six for a point light, on the faces of a cube; none for an
-    ambient one, which has no shadow. Six maps are used side by side:
-
-        cameras = shadow.light_cameras(light, map_size=512, margin=4)
-        maps = [scene.depth(mesh, c, height=512, width=512) for c in cameras]
-        seen = shadow.receivers(depth, camera, cameras)
-        visible = shadow.pcf(jnp.concatenate(maps, axis=1), seen, size=7)
+    A directional light has one, orthographic, that takes in a ball around the scene; a spot
+    light one, as wide as its cone; a point light six, one per face of a cube; an ambient light
+    none, for it has no shadow.
 
     **Arguments:**
 
     - `light`: any of the four.
-    - `map_size`: static; height and width of a map, in pixels.
-    - `centre`, `radius`: the ball that holds the scene, 3 and a scalar, in scene units; a
-      directional light's camera stands two radii before the centre.
-    - `margin`: static; pixels by which each map is wider on each side than the ball, the cone
-      or the cube's face: half a filter's size, lest a filter reach past a face.
+    - `map_size`: static; side of a map, in pixels.
+    - `center`, `radius`: the ball that holds the scene, 3 and a scalar, in scene units; a
+      directional light's camera is placed two radii before the centre.
+    - `margin`: static; pixels by which each map extends beyond the ball, the cone or the
+      cube's face on each side. Half a filter's size keeps filters inside a face.
 
     **Returns:** a tuple of cameras.
 
     **Raises:** `ValueError` for a radius that is not positive, a margin that fills the map, or
     a spot light's cone of pi or more.
 
-    **Gradient:** exact with respect to the light, `centre` and `radius`; zero along the light's
+    **Gradient:** exact with respect to the light, `center` and `radius`; zero along the light's
     own roll, which is arbitrary, and at a direction of zero.
+
+    **Example:** the six maps of a point light are used side by side; here those of an empty
+    scene:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera, PointLight, shadow
+    >>> lamp = PointLight([0, -3, 0], color=[1, 1, 1])
+    >>> cameras = shadow.light_cameras(lamp, map_size=16, margin=1)
+    >>> maps = [jnp.full((16, 16), jnp.inf) for camera in cameras]
+    >>> camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> receivers = shadow.receivers(jnp.ones((8, 8)), camera, cameras)
+    >>> visibility = shadow.pcf(jnp.concatenate(maps, axis=1), receivers, size=3)
+    >>> len(cameras), visibility.shape
+    (6, (8, 8))
 
     Source: Williams 1978; the cube is that of Greene 1986's environment maps.
     """
@@ -71,16 +80,16 @@ def light_cameras(
         lambda n: 0 <= 2 * n < map_size,
         f"0 or more and below half of `map_size`, which is {map_size}",
     )
-    centre = parameter("light_cameras(centre=...)", centre, (3,))
+    center = parameter("light_cameras(center=...)", center, (3,))
     radius = parameter("light_cameras(radius=...)", radius)
-    check("light_cameras(centre=...)", centre, np.isfinite, "finite")
+    check("light_cameras(center=...)", center, np.isfinite, "finite")
     check("light_cameras(radius=...)", radius, lambda v: (v > 0) & (v < np.inf), "positive")
     inner = map_size - 2 * margin
     if isinstance(light, AmbientLight):
         return ()
     if isinstance(light, DirectionalLight):
         forward = normalize(light.direction)
-        pose = _pose(centre.astype(forward.dtype) - 2 * radius * forward, forward)
+        pose = _pose(center.astype(forward.dtype) - 2 * radius * forward, forward)
         middle = [map_size / 2, map_size / 2]
         return (OrthographicCamera(inner / (2 * radius), middle, pose),)
     if isinstance(light, SpotLight):
@@ -92,15 +101,14 @@ def light_cameras(
         )
         pose = _pose(light.position, normalize(light.direction))
         return (_pinhole(jnp.tan(light.outer_angle), inner, map_size, pose),)
-    one = jnp.ones_like(light.position[0])
-    poses = [
-        _pose(light.position, *(jnp.asarray(each, one.dtype) for each in f)) for f in _FACES
-    ]
-    return tuple(_pinhole(one, inner, map_size, pose) for pose in poses)
+    tangent_of_45_degrees = jnp.ones_like(light.position[0])
+    faces = np.asarray(_FACES, light.position.dtype)
+    poses = [_pose(light.position, *map(jnp.asarray, face)) for face in faces]
+    return tuple(_pinhole(tangent_of_45_degrees, inner, map_size, pose) for pose in poses)
 
 
 def _pinhole(tangent: Float[Array, ""], inner: int, map_size: int, pose: Any) -> PinholeCamera:
-    """The camera whose `inner` pixels see `tangent` to either side."""
+    """The camera whose middle `inner` pixels reach `tangent` per unit of depth to each side."""
     focal, half = inner / (2 * tangent), jnp.full_like(tangent, map_size / 2)
     zero, one = jnp.zeros_like(tangent), jnp.ones_like(tangent)
     rows = [[focal, zero, half], [zero, focal, half], [zero, zero, one]]
@@ -110,7 +118,10 @@ def _pinhole(tangent: Float[Array, ""], inner: int, map_size: int, pose: Any) ->
 def _pose(
     eye: Float[Array, "3"], forward: Float[Array, "3"], up: Float[Array, "3"] | None = None
 ) -> Float[Array, "4 4"]:
-    """At `eye`, looking `forward`; without `up`, rows follow the axis farthest from it."""
+    """`world_from_camera` at `eye`, looking `forward`, a unit vector.
+
+    Without `up`, the world axis that is most nearly perpendicular to `forward` is up.
+    """
     if up is None:
         axis = jnp.argmin(jnp.abs(forward))
         up = (jnp.arange(3) == axis).astype(forward.dtype)

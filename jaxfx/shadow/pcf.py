@@ -1,24 +1,24 @@
-"""Shadow-map comparison: alone, after filtering, and before it (percentage closer)."""
+"""Shadow-map comparison: alone, of filtered depths, and filtered itself (percentage closer)."""
 
 import functools as ft
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Num
+from jaxtyping import Array, Float, Num
 
 from jaxfx._checks import WholeNumber
-from jaxfx._filter import apart
-from jaxfx.shadow import _taps
-from jaxfx.shadow._taps import Kernel, Places
+from jaxfx.shadow.arguments import filter_arguments
+from jaxfx.shadow.compare import (
+    Kernel,
+    compare,
+    filtered,
+    offsets,
+    read_texel,
+    set_up,
+    sum_rows,
+    without_gradient,
+)
 from jaxfx.shadow.receivers import Receivers
-
-
-Texels = Float[Array, "texels_down texels_across"]
-
-# Smaller filters are read tap by tap.
-_LEAST_WINDOW = 7
 
 
 def hard(
@@ -28,11 +28,9 @@ def hard(
     bias: Float[ArrayLike, ""] | float | None = None,
     slope_bias: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
-    """Visibility by the comparison alone: 0 or 1, with aliased edges.
+    """Visibility by one comparison per pixel: 0 or 1, with aliased edges.
 
-    A receiver is in shadow where the texel that holds it is nearer to the light than
-    `z - bias - slope_bias * slope`, and lit otherwise: at equality, outside the map, behind
-    the light, and where the texel is inf or missing (0, negative, NaN).
+    The quickest, for previews.
 
     **Arguments:**
 
@@ -40,10 +38,10 @@ def hard(
       nothing.
     - `receivers`: what `receivers` returned, height width.
     - `bias`: scene units by which a texel must be nearer to shadow.
-    - `slope_bias`: pixels of the map by which the same grows where light grazes: so many times
-      the change of depth from one to the next, the receivers' `slope`. Where both are left out,
-      they are what keeps a plane lit and no more: here half a pixel, and what rounding takes.
-      Where one is given, the other is 0.
+    - `slope_bias`: texels (pixels of the map); `slope_bias * receivers.slope` is added to the
+      bias, so that it grows where light grazes a surface. Where both are left out, they are
+      what keeps a plane lit and no more: here half a texel, and what rounding needs. Where one
+      is given, the other is 0.
 
     **Returns:** height width, 0 or 1, in the type of the receivers.
 
@@ -51,10 +49,25 @@ def hard(
 
     **Gradient:** zero, for the comparison is a step: use `pcf` with `softness`.
 
+    **Example:** a wall at depth 4, an occluder at depth 2 over the left half of the map:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera, shadow
+    >>> light_camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> wall = jnp.full((8, 8), 4.0)
+    >>> receivers = shadow.receivers(wall, light_camera, light_camera)
+    >>> shadow_map = wall.at[:, :4].set(2.0)
+    >>> print(shadow.hard(shadow_map, receivers)[4, 2:6])
+    [0. 0. 1. 1.]
+
+    A receiver is in shadow where the texel that holds it is nearer to the light than
+    `z - bias - slope_bias * slope`, and lit otherwise: at equality, outside the map, behind
+    the light, and where the texel is inf or missing (0, negative, NaN).
+
     Source: Williams 1978, section 3.
     """
-    data = _taps.checked("hard", shadow_map, receivers, bias, slope_bias)
-    return jax.lax.stop_gradient(filtered(*data, 1, "box"))
+    arguments = filter_arguments("hard", shadow_map, receivers, bias, slope_bias)
+    return jax.lax.stop_gradient(filtered(*arguments, 1, "box"))
 
 
 def prefiltered(
@@ -67,41 +80,50 @@ def prefiltered(
 ) -> Float[Array, "height width"]:
     """Visibility by comparing with the mean depth of `size` x `size` texels: the wrong order.
 
-    It is still 0 or 1, and the mean of an occluder's depth and its background's is that of
-    neither. Kept to show so. A filter that reaches an inf or past the map's edge is lit.
+    A baseline, kept to show why `pcf` compares first. The result is still 0 or 1, and the mean
+    of an occluder's depth and its background's is the depth of neither.
 
     **Arguments:**
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and texels, as in `hard`, whose defaults serve: the mean
-      of a plane's depths is that of its middle.
+    - `bias`, `slope_bias`: scene units and texels, as in `hard`, with the same defaults: the
+      mean of a plane's depths is that of its middle.
 
-    **Returns:** height width, 0 or 1, in the type of the receivers.
+    **Returns:** height width, 0 or 1, in the type of the receivers. A filter that reaches an
+    inf or past the map's edge is lit.
 
     **Raises:** `ValueError` for a wrong shape, an integer map or an even size.
 
     **Gradient:** zero, as `hard`'s.
 
+    **Example:** the occluder of `hard`'s example casts its shadow one pixel too far:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera, shadow
+    >>> light_camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> wall = jnp.full((8, 8), 4.0)
+    >>> receivers = shadow.receivers(wall, light_camera, light_camera)
+    >>> shadow_map = wall.at[:, :4].set(2.0)
+    >>> print(shadow.prefiltered(shadow_map, receivers, size=3)[4, 2:6])
+    [0. 0. 0. 1.]
+
     Source: the order of filtering that Reeves, Salesin & Cook 1987, section 3, warn of.
     """
-    data = (shadow_map, receivers, bias, slope_bias)
-    data = _taps.checked("prefiltered", *data, size=size, middle=0.5)
-    size = int(size)
-    return jax.lax.stop_gradient(_prefiltered(*data[:4], size))
+    arguments = (shadow_map, receivers, bias, slope_bias)
+    arguments = filter_arguments("prefiltered", *arguments, size=size, mean_reach=0.5)
+    return jax.lax.stop_gradient(_prefiltered(*arguments[:4], int(size)))
 
 
 @ft.partial(jax.jit, static_argnames=("size",))
 def _prefiltered(shadow_map, receivers, bias, slope_bias, size):
-    dtype = _taps.common_dtype(shadow_map, receivers)
-    texels = _taps.pad_map(shadow_map, size, dtype)
-    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
+    texels, places = set_up(shadow_map, receivers, bias, slope_bias, size)
 
-    def row(dy):
-        return sum(read(texels, places, dx, dy) for dx in _taps.taps(size))
+    def row_sum(dy):
+        return sum(read_texel(texels, places, dx, dy) for dx in offsets(size))
 
-    mean = _taps.sum_rows(row, size) / size**2
-    return _taps.lit(mean, places.threshold, None).astype(receivers.z.dtype)
+    mean = sum_rows(row_sum, size) / size**2
+    return compare(mean, places.threshold, None).astype(receivers.z.dtype)
 
 
 def pcf(
@@ -116,20 +138,20 @@ def pcf(
 ) -> Float[Array, "height width"]:
     """Percentage-closer filtering: the share of `size` x `size` texels that do not shadow.
 
-    The filter lies about the texel that holds the receiver. Each texel is compared as in
-    `hard`, then the comparisons are averaged.
+    Shadow edges become as wide as the filter. With `softness` it can be differentiated in
+    everything that moves the receivers; `edge_pcf` gives the same for less.
 
     **Arguments:**
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
-    - `size`: static; odd, in texels.
+    - `size`: static; odd, in texels. The filter lies around the texel that holds the receiver.
     - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, half
-      of `size` texels of slope, half of `softness` and what rounding takes: a plane is lit, and
-      a shadow loses its foot, no wider than the filter, where an occluder touches it.
-    - `softness`: scene units; the comparison goes from 0 to 1 by a smoothstep this wide, half
-      on each side of the bias. Left out, it is a step, to which it tends.
-    - `kernel`: the weights: `"box"`, all the same, wherever in its texel the receiver is; or
-      `"tent"` and `"gaussian"`, centred on the receiver, so that visibility is continuous as
+      of `size` texels of slope, half of `softness` and what rounding needs: a plane is lit, and
+      where an occluder touches it, its shadow starts at most a filter's width away.
+    - `softness`: scene units; the comparison rises from 0 to 1 by a smoothstep of this width,
+      half on each side of the bias. Left out, it is a step, the limit of a small `softness`.
+    - `kernel`: the taps' weights. `"box"`: equal, wherever in its texel the receiver is;
+      `"tent"` and `"gaussian"`: centred on the receiver, so that visibility is continuous as
       it moves.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
@@ -139,92 +161,24 @@ def pcf(
 
     **Gradient:** exact, forward and reverse, with respect to every float, and so to the depth,
     the cameras and the biases behind `receivers`. Of the comparison without `softness`, and of
-    the position with the box, it is zero almost everywhere; what a picture loses by their
+    the position with the box, it is zero almost everywhere; what an image changes by their
     jumps is missing. The map is data: that an occluder moves with the light is missing too.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera, shadow
+    >>> light_camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> wall = jnp.full((8, 8), 4.0)
+    >>> receivers = shadow.receivers(wall, light_camera, light_camera)
+    >>> shadow_map = wall.at[:, :4].set(2.0)
+    >>> percent = 100 * shadow.pcf(shadow_map, receivers, size=3)
+    >>> print(percent[4, 2:6].round())
+    [  0.  33.  67. 100.]
 
     Source: Reeves, Salesin & Cook 1987, section 3; our own: the smooth comparison and the
     weights that follow the receiver.
     """
-    data = (shadow_map, receivers, bias, slope_bias, softness)
-    data = _taps.checked("pcf", *data, size=size, kernel=kernel)
-    return filtered(*_taps.without_gradient(kernel, data), int(size), kernel)
-
-
-@ft.partial(jax.jit, static_argnames=("size", "kernel"))
-def filtered(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
-    """`pcf` of checked arguments."""
-    dtype = _taps.common_dtype(shadow_map, receivers)
-    texels = _taps.pad_map(shadow_map, size, dtype)
-    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
-    result = average(texels, places, softness, size, kernel).astype(receivers.z.dtype)
-    if _taps.is_step(kernel, softness):
-        return result
-    # In memory, so that no tap's derivative adds up anew what a loss asks of the result.
-    return apart(result, lambda: result)
-
-
-def average(
-    texels: Texels,
-    places: Places,
-    softness: Float[Array, ""] | None,
-    size: int,
-    kernel: Kernel,
-) -> Float[Array, "*place"]:
-    """The mean comparison of the taps about each place."""
-    if kernel == "box" and softness is None and size >= _LEAST_WINDOW:
-        return _share(texels, places, size)
-    softness = _taps.everywhere(softness, places)
-
-    def compared(dx, dy):
-        return _taps.lit(read(texels, places, dx, dy), places.threshold, softness)
-
-    if kernel == "box" or size == 1:
-
-        def count(dy):
-            return sum(compared(dx, dy) for dx in _taps.taps(size))
-
-        return _mean(_taps.sum_rows(count, size), size)
-
-    across = [_taps.weight(dx - places.dx, size, kernel) for dx in _taps.taps(size)]
-
-    def row(dy):
-        pairs = zip(across, _taps.taps(size), strict=True)
-        weighted = sum(weight * compared(dx, dy) for weight, dx in pairs)
-        down = jnp.asarray(dy).astype(places.dy.dtype) - places.dy
-        weight = _taps.weight(down, size, kernel)
-        return weight * weighted, weight
-
-    total, down = _taps.sum_rows(row, size)
-    share = total / (down * sum(across))
-    return _one_where(share > 1, share)  # by rounding
-
-
-def read(texels: Texels, places: Places, dx: int, dy: Any) -> Float[Array, "*place"]:
-    """The texel so far from the one that holds each place."""
-    index = (places.row + dy) * texels.shape[1] + (places.column + dx)
-    return texels.reshape(-1).at[index].get(mode="promise_in_bounds")
-
-
-def _share(texels: Texels, places: Places, size: int) -> Float[Array, "*place"]:
-    """The share of lit taps, counted in whole windows: their rows are read as vectors."""
-    shape = places.row.shape
-    row, column, threshold = (each.reshape(-1) for each in places[:3])
-    wide = -(-size // _taps.LANES) * _taps.LANES
-    whole = jax.lax.GatherDimensionNumbers(
-        offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1)
-    )
-    corner = jnp.stack([row, column], axis=-1) - size // 2
-    window = jax.lax.gather(texels, corner, whole, (size, wide), mode="promise_in_bounds")
-    is_lit = (window >= threshold[:, None, None]) & (jnp.arange(wide) < size)[None, None]
-    count = jnp.sum(is_lit, axis=(1, 2), dtype=jnp.int32)
-    return _mean(count.astype(threshold.dtype), size).reshape(shape)
-
-
-def _mean(total: Float[Array, "*place"], size: int) -> Float[Array, "*place"]:
-    """The total over `size**2`; of all that can be, 1, whatever XLA makes of a division."""
-    return _one_where(total == size**2, total / size**2)
-
-
-def _one_where(all_lit: Bool[Array, "*place"], share: Float[Array, "*place"]) -> Array:
-    """As a sum: its derivative asks nothing of the total, which each tap would add up anew."""
-    return share + jax.lax.stop_gradient(jnp.where(all_lit, 1 - share, 0))
+    arguments = (shadow_map, receivers, bias, slope_bias, softness)
+    arguments = filter_arguments("pcf", *arguments, size=size, kernel=kernel)
+    return filtered(*without_gradient(kernel, arguments), int(size), kernel)

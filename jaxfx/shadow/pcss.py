@@ -12,8 +12,8 @@ from jaxfx._arguments import check_camera
 from jaxfx._checks import WholeNumber, check, parameter
 from jaxfx._numerics import absolute, clip01, safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.shadow import _taps
-from jaxfx.shadow.pcf import read
+from jaxfx.shadow.arguments import filter_arguments
+from jaxfx.shadow.compare import compare, offsets, per_place, read_texel, set_up, sum_rows
 from jaxfx.shadow.receivers import Receivers
 
 
@@ -28,19 +28,15 @@ def pcss(
     slope_bias: Float[ArrayLike, ""] | float | None = None,
     softness: Float[ArrayLike, ""] | float | None = None,
 ) -> Float[Array, "height width"]:
-    """Soft shadows of a light with an extent: narrow where a thing stands, wide far from it.
+    """Soft shadows of a light with an extent: narrow near the occluder, wide far from it.
 
-    The mean depth `b` of the texels that shadow a receiver at `z`, among `size` x `size`, gives
-    the penumbra: `light_size * (z - b) / b` across in the scene, for similar triangles. The
-    share of lit texels is then taken over a box that wide, centred on the receiver, from one
-    texel to `size - 1`. Where occluders lie at several depths their mean is that of none, and
-    light leaks below; a penumbra wider than the filter is cut.
+    Costs two filters of `size`, whatever the penumbra.
 
     **Arguments:**
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
-    - `light_camera`: what the map was made with; its scale turns scene units into texels.
-    - `size`: static; odd, in texels.
+    - `light_camera`: the camera of the map; its scale turns scene units into texels.
+    - `size`: static; odd, in texels. A penumbra that is wider is cut to it.
     - `light_size`: the light's diameter, in scene units before a pinhole camera, in radians,
       as seen from the scene, before an orthographic one.
     - `bias`, `slope_bias`, `softness`: scene units and texels, as in `pcf`.
@@ -53,11 +49,29 @@ def pcss(
     **Gradient:** exact with respect to every float. Without `softness` that of the comparisons
     is zero almost everywhere: what remains is that of the penumbra and of the position in it.
 
+    **Example:** the penumbra of a light that appears one radian wide:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera, shadow
+    >>> light_camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> wall = jnp.full((8, 8), 4.0)
+    >>> receivers = shadow.receivers(wall, light_camera, light_camera)
+    >>> shadow_map = wall.at[:, :4].set(2.0)
+    >>> soft = shadow.pcss(shadow_map, receivers, light_camera, size=5, light_size=1.0)
+    >>> print((100 * soft[4, 2:6]).round())
+    [  0.  27.  73. 100.]
+
+    The mean depth `b` of the texels that shadow a receiver at `z`, among `size` x `size`, gives
+    the width of the penumbra: `light_size * (z - b) / b` in the scene, by similar triangles.
+    The share of lit texels is then taken over a box that wide, centred on the receiver, from
+    one texel to `size - 1`. Where occluders lie at several depths, their mean is the depth of
+    none, and light leaks below.
+
     Source: Fernando 2005, percentage-closer soft shadows; the box that follows the receiver
     is our own.
     """
-    data = (shadow_map, receivers, bias, slope_bias, softness)
-    shadow_map, receivers, *rest = _taps.checked("pcss", *data, size=size)
+    arguments = (shadow_map, receivers, bias, slope_bias, softness)
+    shadow_map, receivers, *rest = filter_arguments("pcss", *arguments, size=size)
     check_camera("pcss(light_camera)", light_camera)
     light_size = parameter("pcss(light_size=...)", light_size)
     check("pcss(light_size=...)", light_size, lambda v: v > 0, "positive")
@@ -66,50 +80,50 @@ def pcss(
 
 @ft.partial(jax.jit, static_argnames=("size",))
 def _pcss(shadow_map, receivers, camera, bias, slope_bias, softness, light_size, size):
-    dtype = _taps.common_dtype(shadow_map, receivers)
-    texels = _taps.pad_map(shadow_map, size, dtype)
-    places = _taps.find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
-    softness = _taps.everywhere(softness, places)
+    texels, places = set_up(shadow_map, receivers, bias, slope_bias, size)
+    dtype = texels.dtype
+    softness = per_place(softness, places)
 
-    def blockers(dy: Any):
+    def occluders(dy: Any):
+        """Count and total depth of the texels of a row that shadow."""
         count, total = jnp.zeros_like(places.threshold), jnp.zeros_like(places.threshold)
-        for dx in _taps.taps(size):
-            texel = read(texels, places, dx, dy)
-            shadows = 1 - _taps.lit(texel, places.threshold, softness)
+        for dx in offsets(size):
+            texel = read_texel(texels, places, dx, dy)
+            shadows = 1 - compare(texel, places.threshold, softness)
             count += shadows
             total += shadows * jnp.where(texel < jnp.inf, texel, 0)
         return count, total
 
-    count, total = _taps.sum_rows(blockers, size)
-    mean = safe_divide(total, count)
+    count, total = sum_rows(occluders, size)
+    occluder_depth = safe_divide(total, count)
     z = jnp.where(places.threshold > -jnp.inf, receivers.z.astype(dtype), 1)
-    width = _penumbra(camera, light_size.astype(dtype), z, mean)
-    width = jnp.where((count > 0) & (mean > 0), width, 0)
-    half = jnp.clip(width / 2, 0.5, max(size // 2, 0.5))
+    width = _penumbra(camera, light_size.astype(dtype), z, occluder_depth)
+    width = jnp.where((count > 0) & (occluder_depth > 0), width, 0)
+    half_width = jnp.clip(width / 2, 0.5, max(size // 2, 0.5))
 
-    def along(offset):
-        """The share of a texel that lies in the box."""
-        return clip01(half + 0.5 - absolute(offset))
+    def overlap(offset):
+        """The share of a texel that lies in the box, along one axis."""
+        return clip01(half_width + 0.5 - absolute(offset))
 
-    across = [along(dx - places.dx) for dx in _taps.taps(size)]
+    weights_across = [overlap(dx - places.dx) for dx in offsets(size)]
 
-    def row(dy: Any):
-        pairs = zip(across, _taps.taps(size), strict=True)
+    def weighted_row(dy: Any):
+        pairs = zip(weights_across, offsets(size), strict=True)
         lit = sum(
-            weight * _taps.lit(read(texels, places, dx, dy), places.threshold, softness)
+            weight * compare(read_texel(texels, places, dx, dy), places.threshold, softness)
             for weight, dx in pairs
         )
-        down = along(jnp.asarray(dy).astype(dtype) - places.dy)
-        return down * lit, down
+        weight = overlap(jnp.asarray(dy).astype(dtype) - places.dy)
+        return weight * lit, weight
 
-    lit, down = _taps.sum_rows(row, size)
-    return (lit / (down * sum(across))).astype(receivers.z.dtype)
+    lit, weights_down = sum_rows(weighted_row, size)
+    return (lit / (weights_down * sum(weights_across))).astype(receivers.z.dtype)
 
 
-def _penumbra(camera, light_size, z, blocker):
-    """Its width in texels."""
+def _penumbra(camera, light_size, z, occluder_depth):
+    """The width of the penumbra at each receiver, in texels."""
     if isinstance(camera, OrthographicCamera):
         scale = 2 * jnp.tan(light_size / 2) * camera.pixels_per_unit.astype(z.dtype)
-        return scale * (z - blocker)
+        return scale * (z - occluder_depth)
     focal = camera.intrinsics[0, 0].astype(z.dtype)
-    return safe_divide(light_size * focal * (z - blocker), z * blocker)
+    return safe_divide(light_size * focal * (z - occluder_depth), z * occluder_depth)

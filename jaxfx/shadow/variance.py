@@ -6,16 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._checks import WholeNumber, check, parameter
 from jaxfx._numerics import safe_divide
 from jaxfx._sampling import bilinear
-from jaxfx.shadow import _taps
+from jaxfx.shadow.arguments import filter_arguments
+from jaxfx.shadow.compare import filter_dtype
 from jaxfx.shadow.receivers import Receivers
 
 
-# In lengths of the depth over which the receivers lie; of float32 squares hold such a depth.
+# In multiples of the range of the receivers' depths. Texels farther behind count as this far:
+# their squares, in float32, would otherwise leave no digits for the receivers' depths, and
+# above about 1e19 overflow.
 _FARTHEST = 1e12
 
 
@@ -30,11 +33,8 @@ def variance(
 ) -> Float[Array, "height width"]:
     """Visibility by an upper bound from the mean and the variance of the filtered depths.
 
-    With `m` and `s` the mean and the standard deviation over `size` x `size` texels, read
-    between texels, and `t` the receiver's depth less the bias, it is 1 where `t <= m`, else
-    `s**2 / (s**2 + (t - m)**2)`, Chebyshev's bound. The cost of a receiver does not grow with
-    `size`. The bound is met where there are two depths; where occluders lie over one another
-    it is far above, and light leaks through the lower one.
+    The cost per receiver does not grow with `size`. The bound is exact where there are two
+    depths; where occluders overlap it is far too high, and light leaks through the lower one.
 
     **Arguments:**
 
@@ -43,7 +43,7 @@ def variance(
       nearest as the receivers.
     - `size`: static; odd, in texels.
     - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, what
-      rounding takes: a plane's mean depth, read between texels, is the plane's.
+      rounding needs: a plane's mean depth, read between texels, is the plane's.
     - `min_variance`: scene units squared; the variance is at least this.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
@@ -53,66 +53,93 @@ def variance(
 
     **Gradient:** exact with respect to every float, the farthest depth included.
 
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import OrthographicCamera, shadow
+    >>> light_camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> wall = jnp.full((8, 8), 4.0)
+    >>> receivers = shadow.receivers(wall, light_camera, light_camera)
+    >>> shadow_map = wall.at[:, :4].set(2.0)
+    >>> percent = 100 * shadow.variance(shadow_map, receivers, size=3)
+    >>> print(percent[4, 2:6].round())
+    [  0.  33.  67. 100.]
+
+    With `m` and `s` the mean and the standard deviation over `size` x `size` texels, read
+    between texels, and `t` the receiver's depth less the bias, the visibility is 1 where
+    `t <= m`, else `s**2 / (s**2 + (t - m)**2)`, Chebyshev's bound.
+
     Source: Donnelly & Lauritzen 2006, variance shadow maps, equations 4 and 5.
     """
-    data = (shadow_map, receivers, bias, slope_bias)
-    data = _taps.checked("variance", *data, size=size, middle=0.0)
-    least = parameter("variance(min_variance=...)", min_variance)
-    check(
-        "variance(min_variance=...)", least, lambda v: (v >= 0) & (v < np.inf), "0 or positive"
-    )
-    return _variance(*data[:4], least, int(size))
+    arguments = (shadow_map, receivers, bias, slope_bias)
+    arguments = filter_arguments("variance", *arguments, size=size, mean_reach=0.0)
+    name = "variance(min_variance=...)"
+    least_variance = parameter(name, min_variance)
+    check(name, least_variance, lambda v: (v >= 0) & (v < np.inf), "0 or positive")
+    return _variance(*arguments[:4], least_variance, int(size))
 
 
 @ft.partial(jax.jit, static_argnames=("size",))
-def _variance(shadow_map, receivers, bias, slope_bias, least, size):
-    dtype = _taps.common_dtype(shadow_map, receivers)
+def _variance(shadow_map, receivers, bias, slope_bias, least_variance, size):
+    dtype = filter_dtype(shadow_map.dtype, receivers)
     z = receivers.z.astype(dtype)
     slope = receivers.slope.astype(dtype)
     points = jnp.stack([receivers.u, receivers.v], axis=-1).astype(dtype)
-    known = jnp.isfinite(points).all(axis=-1) & jnp.isfinite(z) & jnp.isfinite(slope) & (z > 0)
-    z, slope = (jnp.where(known, each, 0) for each in (z, slope))
+    is_valid = jnp.isfinite(points).all(axis=-1) & jnp.isfinite(z) & jnp.isfinite(slope)
+    is_valid &= z > 0
+    z, slope = (jnp.where(is_valid, field, 0) for field in (z, slope))
     threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
-    known &= jnp.isfinite(threshold)
-    threshold = jnp.where(known, threshold, 0)
+    is_valid &= jnp.isfinite(threshold)
+    threshold = jnp.where(is_valid, threshold, 0)
 
     shadow_map = jnp.where(shadow_map > 0, shadow_map.astype(dtype), jnp.inf)
-    near, far = _range(shadow_map, threshold, known)
-    # Who lies so far behind all receivers lights them, and takes no digits from their squares.
-    reach = jnp.max(jnp.where(known, threshold, near)) - near
-    far = jnp.minimum(far, near + _FARTHEST * reach)
+    near, far = _depth_range(shadow_map, threshold, is_valid)
+    # A texel that far behind all receivers lights them, but its square would take their digits.
+    receiver_range = jnp.max(jnp.where(is_valid, threshold, near)) - near
+    far = jnp.minimum(far, near + _FARTHEST * receiver_range)
     scale = jnp.where(far > near, far - near, 1)
     depth = jnp.minimum(shadow_map, far)
+    # From here on in units of the range, 0 at the nearest depth.
     depth = jnp.pad((depth - near) / scale, size + 1, constant_values=(far - near) / scale)
-    moments = _mean(jnp.stack([depth, depth * depth], axis=-1), size)
+    moments = _box_mean(jnp.stack([depth, depth * depth], axis=-1), size)
 
-    reach = jnp.asarray(shadow_map.shape[::-1], dtype)[None, None] + size // 2 + 1
-    inside = jnp.clip(points, -(size // 2) - 1, reach)
-    read = bilinear(moments, jnp.where(known[..., None], inside, -1.0 - size // 2) + size + 1)
-    mean = read[..., 0]
-    spread = jnp.maximum(read[..., 1] - mean * mean, least.astype(dtype) / scale**2)
+    border = jnp.asarray(shadow_map.shape[::-1], dtype)[None, None] + size // 2 + 1
+    inside = jnp.clip(points, -(size // 2) - 1, border)
+    pixels = jnp.where(is_valid[..., None], inside, -1.0 - size // 2) + size + 1
+    sampled = bilinear(moments, pixels)
+    mean = sampled[..., 0]
+    least = least_variance.astype(dtype) / scale**2
+    squared_deviation = jnp.maximum(sampled[..., 1] - mean * mean, least)
     behind = (threshold - near) / scale - mean
-    bound = safe_divide(spread, spread + behind * behind)
-    return jnp.where(known & (behind > 0), bound, 1).astype(receivers.z.dtype)
+    bound = safe_divide(squared_deviation, squared_deviation + behind * behind)
+    return jnp.where(is_valid & (behind > 0), bound, 1).astype(receivers.z.dtype)
 
 
-def _range(shadow_map, threshold, known):
-    """The nearest and the farthest depth that there are; 0 and 0 where there is none."""
+def _depth_range(
+    shadow_map: Float[Array, "rows columns"],
+    threshold: Float[Array, "height width"],
+    is_valid: Bool[Array, "height width"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The nearest and the farthest finite depth of map and receivers; 0 where there is none."""
     finite = jnp.isfinite(shadow_map)
 
     def over(reduce, start):
-        own = reduce(jnp.where(finite, shadow_map, start))
-        other = reduce(jnp.where(known, threshold, start))
-        found = reduce(jnp.stack([own, other]))
-        return jnp.where(jnp.isfinite(found), found, 0)
+        of_map = reduce(jnp.where(finite, shadow_map, start))
+        of_receivers = reduce(jnp.where(is_valid, threshold, start))
+        extreme = reduce(jnp.stack([of_map, of_receivers]))
+        return jnp.where(jnp.isfinite(extreme), extreme, 0)
 
     return over(jnp.min, jnp.inf), over(jnp.max, -jnp.inf)
 
 
-def _mean(image: Float[Array, "height width 2"], size: int) -> Float[Array, "height width 2"]:
+def _box_mean(
+    image: Float[Array, "height width 2"], size: int
+) -> Float[Array, "height width 2"]:
+    """The mean over `size` x `size` pixels; outside the image counts as 0."""
     for axis in (0, 1):
         window = [1, 1, 1]
         window[axis] = size
-        zero = np.zeros((), image.dtype)  # known when traced, or it has no reverse pass
+        # A NumPy scalar is known when traced; with a traced one there is no reverse pass.
+        zero = np.zeros((), image.dtype)
         image = jax.lax.reduce_window(image, zero, jax.lax.add, window, (1, 1, 1), "SAME")
     return image / size**2

@@ -21,11 +21,11 @@ from tests.shadow.test_edge import (  # noqa: F401
 )
 
 
-@pytest.mark.parametrize("mask", ["depth", "screen"])
-def test_the_filter_is_taken_where_the_mask_asks_for_it(case, mask):  # noqa: F811
+@pytest.mark.parametrize("edges", ["depth", "screen"])
+def test_the_filter_is_taken_where_the_mask_asks_for_it(case, edges):  # noqa: F811
     """Every pixel by the naive loop; by the screen those that no edge reaches stay hard."""
-    options = {"size": 7, "mask": mask, "bias": 0.02}
-    options |= {"dilation": 2} if mask == "screen" else {}
+    options = {"size": 7, "edges": edges, "bias": 0.02}
+    options |= {"dilation": 2} if edges == "screen" else {}
     visible = shadow.edge_pcf(*case, **options)
     where = shadow.candidates(*case, **options).where
     full, hard = (naive_pcf(*case, size, bias=0.02) for size in (7, 1))
@@ -42,7 +42,7 @@ def test_what_the_mask_by_screen_leaves_out_has_no_derivative(case):  # noqa: F8
     """Forward and reverse against the derivative of the filter, by the mask."""
     shadow_map, receivers = case
     options = {"size": 3, "bias": 0.02, "softness": 0.3}
-    screen = {"mask": "screen", "dilation": 1}
+    screen = {"edges": "screen", "dilation": 1}
     where = shadow.candidates(*case, **options, **screen).where
     assert where.any() and not where.all()
 

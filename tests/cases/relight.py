@@ -198,9 +198,9 @@ def new_view(method):
     count, degrees = VIEWS[method]
     gbuffers, cameras = (each[:count] for each in _around())
     target, truth, expected = _view(degrees)
-    found, coverage = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
-    shown, seen = np.asarray(truth.shader) >= 0, np.asarray(coverage) > 0
-    filled, _ = relight.fill_holes(found, coverage)
+    found, views = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
+    shown, seen = np.asarray(truth.shader) >= 0, np.asarray(views) > 0
+    filled, _ = relight.fill_holes(found, views)
     image = relight.render(filled, target, scene.default_lights(target))
     names = ("color", "diffuse", "specular", "roughness", "normal")
     holes = shown & ~seen
@@ -252,8 +252,8 @@ def close_surfaces(method):
         cameras, truth = CAMERAS, split_view(FRONTAL, other, TARGET, edge)
         gbuffers = [split_view(FRONTAL, other, camera, edge) for camera in cameras]
     options = {"depth": truth.depth, "tolerance": 0.005}
-    found, coverage = relight.synthesize(gbuffers, cameras, TARGET, **options)
-    color, covered = np.asarray(found.color), np.asarray(coverage) > 0
+    found, views = relight.synthesize(gbuffers, cameras, TARGET, **options)
+    color, covered = np.asarray(found.color), np.asarray(views) > 0
     apart = [np.abs(color - pure).max(axis=-1)[covered] for pure in (RED, BLUE)]
     wrong = np.abs(color - np.asarray(truth.color)).max(axis=-1)[covered] > 1e-6
     seen = pinhole_sees(truth, cameras[0]) if len(cameras) == 2 else np.ones((24, 32), bool)

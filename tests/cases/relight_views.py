@@ -131,6 +131,20 @@ def cache(camera, size=SIZE):
     return scene.gbuffer(MESH, camera, height=size[0], width=size[1], backend="embree")
 
 
+LARGE = (96, 128)
+# Of `orbit`: degrees to the side, and scene units upwards.
+AROUND = [
+    (-6, 0.0),
+    (6, 0.0),
+    (0, 0.25),
+    (0, -0.2),
+    (-14, 0.1),
+    (14, 0.1),
+    (-10, 0.4),
+    (10, 0.4),
+]
+
+
 # Planes.
 
 

@@ -21,7 +21,7 @@ SIZES["5 texels, float64"] = (5, np.float64)
 
 @case("shadow", {"pixels": 0.0}, SIZES, HARD)
 def mask_by_depth(method):
-    """Pixels of `edge_pcf(mask="depth")` of which any bit differs from `pcf`, of 16,000: four
+    """Pixels of `edge_pcf(edges="depth")` of which any bit differs from `pcf`, of 16,000: four
     random maps with receivers in and about them, two biases. (Even sizes are a named error:
     tests/shadow/test_pcf.py.)"""
     size, dtype = SIZES[method]
@@ -31,7 +31,7 @@ def mask_by_depth(method):
     for each in data:
         for slope_bias in (0.0, 0.7):
             options = {"size": size, "bias": 0.013, "slope_bias": slope_bias}
-            visible = np.asarray(shadow.edge_pcf(*each, mask="depth", **options))
+            visible = np.asarray(shadow.edge_pcf(*each, edges="depth", **options))
             differing += int((visible != np.asarray(shadow.pcf(*each, **options))).sum())
     return Found({"pixels": float(differing)}, visible)
 
@@ -53,13 +53,13 @@ MISSING = ("4x, dilation 1", "4x, dilation 4", *list(SCREENS)[-2:])
 
 @case("shadow", {"share": 0.0}, SCREENS, {m: MISSED if m in MISSING else HARD for m in SCREENS})
 def mask_by_screen(method):
-    """The share of pixels where `edge_pcf(mask="screen")` differs from `pcf` at 7x7: the shadow
-    of a plate, so many pixels to a texel, with the usual dilation or a given one."""
+    """The share of pixels where `edge_pcf(edges="screen")` differs from `pcf` at 7x7: the
+    shadow of a plate, so many pixels to a texel, with the usual dilation or a given one."""
     magnification, width, moved, dilation = SCREENS[method]
     shadow_map, receivers = plate(magnification, width)
     receivers = receivers._replace(u=receivers.u + moved)
     data, options = (shadow_map, receivers), {"size": 7}
-    screen = np.asarray(shadow.edge_pcf(*data, mask="screen", dilation=dilation, **options))
+    screen = np.asarray(shadow.edge_pcf(*data, edges="screen", dilation=dilation, **options))
     differs = screen != np.asarray(shadow.pcf(*data, **options))
     return Found({"share": float(differs.mean())}, np.where(differs, np.nan, screen))
 
@@ -102,7 +102,7 @@ FILTERS: dict[str, Any] = {
     "prefiltered": ft.partial(shadow.prefiltered, size=3),
     "pcf": ft.partial(shadow.pcf, size=3),
     "pcf, soft Gaussian": ft.partial(shadow.pcf, size=3, kernel="gaussian", softness=0.3),
-    "edge_pcf": ft.partial(shadow.edge_pcf, size=3, mask="depth"),
+    "edge_pcf": ft.partial(shadow.edge_pcf, size=3, edges="depth"),
     "pcss": lambda *data: shadow.pcss(*data, CAMERA, size=3, light_size=0.1),
     "variance": ft.partial(shadow.variance, size=3),
 }
@@ -150,7 +150,7 @@ def comparisons(method):
     I + B F^2, with one I more for the mask by depth; and their share of `pcf`'s, I F^2."""
     mask, size = COUNTED[method]
     shadow_map, fields = two_discs(size)
-    found = shadow.candidates(shadow_map, shadow.Receivers(*fields), size=size, mask=mask)
+    found = shadow.candidates(shadow_map, shadow.Receivers(*fields), size=size, edges=edges)
     where = np.asarray(found.where)
     expected = (2 if mask == "depth" else 1) * where.size + where.sum() * size**2
     off = abs(int(found.comparisons) - int(expected))

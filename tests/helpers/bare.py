@@ -80,7 +80,7 @@ def effects():
         "relight.render": ((gbuffer, camera, [lamp]), {}),
         "relight.start": ((gbuffer, camera, [lamp]), {}),
         "relight.synthesize": (([gbuffer], [camera], camera), {"depth": depth}),
-        "relight.best_caches": (([gbuffer], [camera], camera), {"depth": depth, "count": 1}),
+        "relight.choose": (([gbuffer], [camera], camera), {"depth": depth, "count": 1}),
         "relight.fill_holes": ((gbuffer, np.ones(SIZE, np.int32)), {}),
         "relight.capture_normals": ((lambda lights: jnp.asarray(image),), {}),
         "relight.indirect": ((gbuffer, transfer, [lamp]), {}),

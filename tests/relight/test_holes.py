@@ -40,17 +40,17 @@ def holes(kind):
     "kind", ["few", "many", "block", "one-pixel-left", "left-column", "none"]
 )
 def test_is_the_nearest_covered_pixel(kind):
-    coverage = holes(kind)
+    views = holes(kind)
     gbuffer = numbered()
-    filled, count = relight.fill_holes(gbuffer, coverage)
-    assert int(count) == (coverage == 0).sum()
-    source = np.rint(np.asarray(filled.roughness) * coverage.size).astype(int)
+    filled, count = relight.fill_holes(gbuffer, views)
+    assert int(count) == (views == 0).sum()
+    source = np.rint(np.asarray(filled.roughness) * views.size).astype(int)
     row, column = np.divmod(source, SIZE[1])
     y, x = np.indices(SIZE)
     np.testing.assert_allclose(
-        np.hypot(row - y, column - x), ndimage.distance_transform_edt(coverage == 0), atol=1e-12
+        np.hypot(row - y, column - x), ndimage.distance_transform_edt(views == 0), atol=1e-12
     )
-    assert (coverage[row, column] > 0).all()
+    assert (views[row, column] > 0).all()
     for name in ("color", "ambient", "diffuse", "specular", "normal"):
         assert (np.asarray(getattr(filled, name)) == source[..., None]).all()
     assert (np.asarray(filled.shader) == source % 3).all()
@@ -60,12 +60,12 @@ def test_is_the_nearest_covered_pixel(kind):
 def test_background_is_neither_filled_nor_taken_from():
     depth = np.full(SIZE, 2.0)
     depth[:, :20] = np.inf
-    coverage = np.where(np.isfinite(depth), 1, 0)
-    coverage[5, 20:23] = 0
-    shader = np.where(coverage > 0, 1, -1)
+    views = np.where(np.isfinite(depth), 1, 0)
+    views[5, 20:23] = 0
+    shader = np.where(views > 0, 1, -1)
     gbuffer = numbered(shader=shader)
     gbuffer = GBuffer(**{**vars(gbuffer), "depth": depth})
-    filled, count = relight.fill_holes(gbuffer, coverage)
+    filled, count = relight.fill_holes(gbuffer, views)
     assert int(count) == 3
     np.testing.assert_array_equal(filled.shader, np.where(np.isfinite(depth), 1, -1))
 
@@ -79,21 +79,21 @@ def test_nothing_covered_leaves_everything():
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1)])
 def test_any_size(size):
-    coverage = np.zeros(size, int)
-    coverage[-1, -1] = 3
-    filled, count = relight.fill_holes(numbered(size), coverage)
+    views = np.zeros(size, int)
+    views[-1, -1] = 3
+    filled, count = relight.fill_holes(numbered(size), views)
     assert int(count) == size[0] * size[1] - 1
     assert (np.asarray(filled.color) == size[0] * size[1] - 1).all()
 
 
 def test_a_filled_pixel_has_the_derivative_of_the_one_it_was_taken_from():
-    coverage = np.ones(SIZE, int)
-    coverage[3:6, 7] = 0
+    views = np.ones(SIZE, int)
+    views[3:6, 7] = 0
     gbuffer = numbered()
 
     def red(color):
         changed = GBuffer(**{**vars(gbuffer), "color": color})
-        return relight.fill_holes(changed, coverage)[0].color
+        return relight.fill_holes(changed, views)[0].color
 
     weight = np.random.default_rng(2).random((*SIZE, 3))
     (pulled,) = jax.vjp(red, gbuffer.color)[1](jnp.asarray(weight))
@@ -105,5 +105,5 @@ def test_a_filled_pixel_has_the_derivative_of_the_one_it_was_taken_from():
 
 def test_errors_name_the_argument():
     fill = inspect.unwrap(relight.fill_holes)
-    with pytest.raises(ValueError, match=r"`fill_holes\(coverage\)` must have the cache's"):
+    with pytest.raises(ValueError, match=r"`fill_holes\(views\)` must have the cache's"):
         fill(numbered(), np.ones((2, 2), int))

@@ -15,6 +15,7 @@ from tests.cases.relight_views import (
     CAMERAS,
     FRONTAL,
     HEIGHT,
+    LARGE,
     RED,
     SIZE,
     TARGET,
@@ -33,7 +34,7 @@ FLOATS = ("color", "ambient", "diffuse", "specular", "roughness", "normal")
 
 def loop(gbuffers, cameras, target, depth, field, tolerance):
     """Equations 2 and 3, pixel by pixel, gated by the distance along the ray alone."""
-    image, coverage = np.zeros((*depth.shape, 3)), np.zeros(depth.shape, int)
+    image, views = np.zeros((*depth.shape, 3)), np.zeros(depth.shape, int)
 
     def split(camera):
         pose = np.asarray(camera.world_from_camera, float)
@@ -52,16 +53,16 @@ def loop(gbuffers, cameras, target, depth, field, tolerance):
                 continue
             if abs(float(gbuffer.depth[row, column]) - z) <= tolerance * z:
                 values.append(np.asarray(getattr(gbuffer, field))[row, column])
-        coverage[j, i] = len(values)
+        views[j, i] = len(values)
         image[j, i] = np.mean(values, axis=0) if values else 0
-    return image, coverage
+    return image, views
 
 
 def test_the_same_camera_gives_the_same_cache():
     camera = orbit(0)
     gbuffer = cache(camera)
-    found, coverage = relight.synthesize([gbuffer], [camera], camera, depth=gbuffer.depth)
-    np.testing.assert_array_equal(coverage, np.isfinite(gbuffer.depth))
+    found, views = relight.synthesize([gbuffer], [camera], camera, depth=gbuffer.depth)
+    np.testing.assert_array_equal(views, np.isfinite(gbuffer.depth))
     for name in (*FLOATS, "shader", "depth"):
         np.testing.assert_allclose(
             getattr(found, name), getattr(gbuffer, name), rtol=1e-6, atol=1e-6, err_msg=name
@@ -73,10 +74,10 @@ def test_equals_the_loop_over_pixels():
     """On a plane that faces the cameras more or less, where the tests agree."""
     gbuffers = [FRONTAL(camera) for camera in CAMERAS]
     depth = np.asarray(FRONTAL(TARGET).depth)
-    found, coverage = relight.synthesize(gbuffers, CAMERAS, TARGET, depth=depth, tolerance=0.03)
+    found, views = relight.synthesize(gbuffers, CAMERAS, TARGET, depth=depth, tolerance=0.03)
     image, expected = loop(gbuffers, CAMERAS, TARGET, depth, "diffuse", 0.03)
     assert {2, 3} <= set(np.unique(expected))
-    np.testing.assert_array_equal(coverage, expected)
+    np.testing.assert_array_equal(views, expected)
     np.testing.assert_allclose(found.diffuse, image, rtol=1e-12)
 
 
@@ -86,12 +87,12 @@ def test_caches_of_other_sizes_and_cameras():
     camera = OrthographicCamera(15.0, [10, 20], np.eye(4))
     gbuffer = plane([0.3, 0, -1], size=size)(camera, color=0.6)
     depth = plane([0.3, 0, -1])(TARGET).depth
-    found, coverage = relight.synthesize([gbuffer], [camera], TARGET, depth=depth)
+    found, views = relight.synthesize([gbuffer], [camera], TARGET, depth=depth)
     pixels, _ = camera.project(jnp.asarray(points(TARGET, depth)))
     x, y = np.moveaxis(np.asarray(pixels), -1, 0)
     inside = (x >= 0) & (x < 20) & (y >= 0) & (y < 40)
     assert 0 < inside.sum() < inside.size
-    np.testing.assert_array_equal(coverage, inside)
+    np.testing.assert_array_equal(views, inside)
     expected = np.broadcast_to(np.where(inside, 0.6, 0)[..., None], (*SIZE, 3))
     np.testing.assert_allclose(found.color, expected)
 
@@ -106,30 +107,8 @@ def test_an_oblique_plane_is_seen_whole_although_its_depth_is_steep():
         rise = np.abs(np.diff(depth, axis=0, append=np.nan)) / depth
     assert np.nanmax(rise[near]) > 20 * tolerance
     caches = [steep(CAMERAS[0])], [CAMERAS[0]]
-    _, coverage = relight.synthesize(*caches, camera, depth=depth, tolerance=tolerance)
-    assert (np.asarray(coverage) > 0)[near].mean() > 0.9
-
-
-# --- Several caches.
-
-
-LARGE = (96, 128)
-AROUND = [
-    (-6, 0.0),
-    (6, 0.0),
-    (0, 0.25),
-    (0, -0.2),
-    (-14, 0.1),
-    (14, 0.1),
-    (-10, 0.4),
-    (10, 0.4),
-]
-
-
-@pytest.fixture(scope="module")
-def caches():
-    cameras = [orbit(*where, size=LARGE) for where in AROUND]
-    return [cache(camera, LARGE) for camera in cameras], cameras
+    _, views = relight.synthesize(*caches, camera, depth=depth, tolerance=tolerance)
+    assert (np.asarray(views) > 0)[near].mean() > 0.9
 
 
 # --- Surfaces that differ.
@@ -149,11 +128,11 @@ def test_normals_are_averaged_on_the_sphere():
         unit = normal / np.linalg.norm(normal)
         image = jnp.broadcast_to(jnp.asarray(unit), (*SIZE, 3))
         bent.append(eqx.tree_at(lambda g: g.normal, FRONTAL(camera), image))
-    found, coverage = relight.synthesize(
+    found, views = relight.synthesize(
         bent, CAMERAS, TARGET, depth=FRONTAL(TARGET).depth, tolerance=0.1, angle=0.6
     )
     total = one / np.linalg.norm(one) + 2 * other / np.linalg.norm(other)
-    full = np.asarray(coverage) == 3
+    full = np.asarray(views) == 3
     assert full.any()
     np.testing.assert_allclose(
         np.asarray(found.normal)[full] - total / np.linalg.norm(total), 0, atol=1e-12
@@ -163,11 +142,11 @@ def test_normals_are_averaged_on_the_sphere():
 def test_zero_normals_are_gated_by_depth_alone():
     bare = [eqx.tree_at(lambda g: g.normal, FRONTAL(c), jnp.zeros((*SIZE, 3))) for c in CAMERAS]
     depth = FRONTAL(TARGET).depth
-    found, coverage = relight.synthesize(bare, CAMERAS, TARGET, depth=depth, tolerance=0.03)
+    found, views = relight.synthesize(bare, CAMERAS, TARGET, depth=depth, tolerance=0.03)
     _, expected = relight.synthesize(
         [FRONTAL(c) for c in CAMERAS], CAMERAS, TARGET, depth=depth, tolerance=0.03
     )
-    assert (np.asarray(coverage > 0) == np.asarray(expected > 0)).all()
+    assert (np.asarray(views > 0) == np.asarray(expected > 0)).all()
     assert np.isfinite(found.color).all() and not np.asarray(found.normal).any()
 
 
@@ -200,7 +179,7 @@ def test_a_bad_pixel_of_a_cache_spoils_no_derivative_of_the_cameras(name):
     depth = FRONTAL(TARGET).depth
 
     def color(cameras, target):
-        options = {"depth": depth, "weights": "detail", "tolerance": 0.03}
+        options = {"depth": depth, "weighting": "detail", "tolerance": 0.03}
         return relight.synthesize(gbuffers, cameras, target, **options)[0].color
 
     @jax.jit
@@ -223,9 +202,9 @@ def test_what_is_missing_in_a_depth_is_no_hole_to_fill(missing):
         cached = jnp.where(lost, nothing, gbuffers[0].depth)
         holed = eqx.tree_at(lambda g: g.depth, gbuffers[0], cached)
         given = jnp.where(lost, nothing, depth)
-        buffer, coverage = relight.synthesize([holed], CAMERAS[:1], TARGET, depth=given)
-        covered.append((coverage, relight.fill_holes(buffer, coverage)[1]))
-        found.append(relight.fill_holes(buffer, coverage)[0])
+        buffer, views = relight.synthesize([holed], CAMERAS[:1], TARGET, depth=given)
+        covered.append((views, relight.fill_holes(buffer, views)[1]))
+        found.append(relight.fill_holes(buffer, views)[0])
     np.testing.assert_array_equal(covered[1][0], covered[0][0])
     assert int(covered[1][1]) == int(covered[0][1]) > 0
     for name in (*FLOATS, "shader"):
@@ -249,10 +228,10 @@ def test_a_scene_of_any_scale_gives_the_same_view(scale):
         images = color, np.zeros((8, 10), int), color, color, color, facing, depth
         gbuffer = GBuffer(*images, np.full((8, 10), 0.5, np.float32))
         eyes = eye(0, size), eye(0.4, size)
-        options = {"depth": depth, "weights": "detail", "tolerance": 0.02}
+        options = {"depth": depth, "weighting": "detail", "tolerance": 0.02}
         found.append(relight.synthesize([gbuffer] * 2, eyes, eye(0.1, size), **options))
-    (one, coverage), (other, same) = found
-    np.testing.assert_array_equal(same, coverage)
+    (one, views), (other, same) = found
+    np.testing.assert_array_equal(same, views)
     np.testing.assert_allclose(other.color, one.color, atol=1e-6)
 
 
@@ -265,10 +244,10 @@ def test_detail_favours_the_camera_that_is_nearer():
     gbuffers = [FRONTAL(cameras[0], color=RED), FRONTAL(near, color=BLUE)]
     depth = FRONTAL(TARGET).depth
     red = {
-        weights: relight.synthesize(
-            gbuffers, cameras, TARGET, depth=depth, weights=weights, tolerance=0.1
+        weighting: relight.synthesize(
+            gbuffers, cameras, TARGET, depth=depth, weighting=weighting, tolerance=0.1
         )
-        for weights in ("equal", "detail")
+        for weighting in ("equal", "detail")
     }
     both = np.asarray(red["equal"][1]) == 2
     assert both.any()
@@ -286,9 +265,9 @@ def test_detail_favours_the_camera_that_is_nearer():
 # --- Derivatives.
 
 
-@pytest.mark.parametrize("weights", ["equal", "detail"])
+@pytest.mark.parametrize("weighting", ["equal", "detail"])
 @pytest.mark.full
-def test_derivatives_in_the_caches_and_cameras(weights):
+def test_derivatives_in_the_caches_and_cameras(weighting):
     """Forward, reverse and differences: in float64 the steps move no point to another pixel."""
     tilted = plane([0.1, 0.2, -1])
     gbuffers = [tilted(camera) for camera in CAMERAS[:2]]
@@ -299,7 +278,7 @@ def test_derivatives_in_the_caches_and_cameras(weights):
     def loss(floats, cameras, target, depth):
         gbuffers = eqx.combine(floats, others)
         found, _ = relight.synthesize(
-            gbuffers, cameras, target, depth=depth, weights=weights, tolerance=0.05
+            gbuffers, cameras, target, depth=depth, weighting=weighting, tolerance=0.05
         )
         images = eqx.filter(found, eqx.is_inexact_array)
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(images))
@@ -317,39 +296,6 @@ def test_derivatives_in_the_caches_and_cameras(weights):
     assert float(pushed) == pytest.approx(float(sum(jnp.vdot(*p) for p in pairs)), rel=1e-9)
 
 
-# --- The choice of caches.
-
-
-@pytest.mark.full
-def test_best_caches_sees_most_first_and_never_twice(caches):
-    gbuffers, cameras = caches
-    target = orbit(12, 0.1, LARGE)
-    depth = cache(target, LARGE).depth
-    order = np.asarray(relight.best_caches(gbuffers, cameras, target, depth=depth, count=8))
-    assert sorted(order) == list(range(8))
-    assert order[0] == 5  # two degrees away; the next is six
-    covered = lambda which: np.mean(
-        relight.synthesize(
-            [gbuffers[i] for i in which], [cameras[i] for i in which], target, depth=depth
-        )[1]
-        > 0
-    )
-    # Three of them do better than the first three, and than any one.
-    assert covered(order[:3]) > covered([0, 1, 2])
-    assert covered(order[:1]) >= max(covered([i]) for i in range(8)) - 0.02
-
-
-def test_best_caches_passes_over_one_that_looks_away():
-    away = PinholeCamera.look_at(
-        [0, 0, 0], [0, 0, -3], up=[0, -1, 0], fov_y=0.7, height=HEIGHT, width=WIDTH
-    )
-    cameras = [away, *CAMERAS]
-    gbuffers = [FRONTAL(camera) for camera in cameras]
-    depth = FRONTAL(TARGET).depth
-    order = relight.best_caches(gbuffers, cameras, TARGET, depth=depth, count=4, stride=3)
-    assert int(order[-1]) == 0
-
-
 def psnr(image, reference, mask=None):
     return float(metrics.psnr(image, reference, mask=mask))
 
@@ -358,8 +304,8 @@ def new_view(caches, count, degrees):
     gbuffers, cameras = (each[:count] for each in caches)
     target = orbit(degrees, 0.1, LARGE)
     truth = cache(target, LARGE)
-    found, coverage = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
-    return target, truth, found, np.asarray(coverage)
+    found, views = relight.synthesize(gbuffers, cameras, target, depth=truth.depth)
+    return target, truth, found, np.asarray(views)
 
 
 @first("degrees", [5, 15, 30])
@@ -368,10 +314,10 @@ def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
     """PSNR of every parameter, ids exact, and the relit picture, filled and outside holes."""
     shares = []
     for count in (1, 2, 4, 8):
-        target, truth, found, coverage = new_view(caches, count, degrees)
+        target, truth, found, views = new_view(caches, count, degrees)
         shown = np.asarray(truth.shader) >= 0
-        seen = coverage > 0
-        assert not seen[~shown].any() and coverage.max() <= count
+        seen = views > 0
+        assert not seen[~shown].any() and views.max() <= count
         shares.append(seen[shown].mean())
         assert set(np.unique(found.shader)) <= {-1, 0, 2}
         wrong = np.asarray(found.shader != truth.shader)[seen]
@@ -382,7 +328,7 @@ def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
         length = np.linalg.norm(np.asarray(found.normal), axis=-1)
         np.testing.assert_allclose(length, seen, atol=1e-5)
 
-        filled, holes = relight.fill_holes(found, coverage)
+        filled, holes = relight.fill_holes(found, views)
         assert int(holes) == (shown & ~seen).sum()
         assert (np.asarray(filled.shader)[shown] >= 0).all()
         lights = scene.default_lights(target)
@@ -398,22 +344,21 @@ def test_a_missing_depth_is_nothing_and_stays_so(missing):
     gbuffer = FRONTAL(TARGET)
     depth = np.array(gbuffer.depth)
     depth[1, 2] = missing
-    found, coverage = relight.synthesize([gbuffer], [TARGET], TARGET, depth=depth)
+    found, views = relight.synthesize([gbuffer], [TARGET], TARGET, depth=depth)
     full, covered = relight.synthesize([gbuffer], [TARGET], TARGET, depth=gbuffer.depth)
     assert covered[1, 2] == 1
     there = np.ones(depth.shape, bool)
     there[1, 2] = False
-    np.testing.assert_array_equal(coverage, np.where(there, covered, 0))
+    np.testing.assert_array_equal(views, np.where(there, covered, 0))
     assert found.shader[1, 2] == -1
     np.testing.assert_array_equal(np.asarray(found.color)[there], np.asarray(full.color)[there])
-    filled, count = relight.fill_holes(found, coverage)
+    filled, count = relight.fill_holes(found, views)
     assert int(count) == 0
     assert filled.shader[1, 2] == -1
 
 
 def test_errors_name_the_argument():
     synthesize = inspect.unwrap(relight.synthesize)
-    best = inspect.unwrap(relight.best_caches)
     gbuffer, depth = FRONTAL(TARGET), FRONTAL(TARGET).depth
     with pytest.raises(ValueError, match=r"`synthesize\(gbuffers\)` must be a sequence of at"):
         synthesize([], [], TARGET, depth=depth)
@@ -426,8 +371,3 @@ def test_errors_name_the_argument():
     for name, value in (("tolerance", 0.0), ("angle", -1.0)):
         with pytest.raises(ValueError, match=rf"`synthesize\({name}=...\)` must be positive"):
             synthesize([gbuffer], [TARGET], TARGET, depth=depth, **{name: value})
-    for count in (0, 2):
-        with pytest.raises(ValueError, match=r"`best_caches\(count=...\)` must be in \[1, 1\]"):
-            best([gbuffer], [TARGET], TARGET, depth=depth, count=count)
-    with pytest.raises(ValueError, match=r"`best_caches\(stride=...\)` must be at least 1"):
-        best([gbuffer], [TARGET], TARGET, depth=depth, count=1, stride=0)

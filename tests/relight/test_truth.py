@@ -62,7 +62,7 @@ def test_a_bounce_is_the_path_tracers_but_for_the_noise_of_both():
     gbuffer, light = truth.lambert(mesh, camera, size), truth.LIGHTS["directional"]
     transfer = scene.transfer(mesh, gbuffer, camera, point_count=512, rank=64)
     lit = truth.unshadowed(mesh, np.asarray(transfer.position, float), light)
-    image = np.asarray(relight.indirect(gbuffer, transfer, [light], lit=[lit]))
+    image = np.asarray(relight.indirect(gbuffer, transfer, [light], visibilities=[lit]))
     expected, noise = truth.bounced(mesh, camera, light, size, 128)
     error, size = (np.sqrt(np.mean(v**2)) for v in (image - expected, expected))
     assert np.sqrt(np.mean(noise**2)) < 0.2 * size

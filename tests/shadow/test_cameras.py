@@ -20,13 +20,13 @@ LIGHTS = {
 
 
 def test_a_directional_light_takes_in_the_ball():
-    centre, radius = np.array([1.0, 2.0, 3.0]), 2.0
+    center, radius = np.array([1.0, 2.0, 3.0]), 2.0
     (camera,) = shadow.light_cameras(
-        LIGHTS["sun"], map_size=64, centre=centre, radius=radius, margin=4
+        LIGHTS["sun"], map_size=64, center=center, radius=radius, margin=4
     )
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500, 3))
-    points = centre + radius * points / np.linalg.norm(points, axis=-1, keepdims=True)
+    points = center + radius * points / np.linalg.norm(points, axis=-1, keepdims=True)
     pixels, z = map(np.asarray, camera.project(jnp.asarray(points)))
     assert 4 <= pixels.min() < 5
     assert 59 < pixels.max() <= 60

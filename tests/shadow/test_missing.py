@@ -17,7 +17,7 @@ FILTERS = {
     "hard": shadow.hard,
     "prefiltered": lambda *data, **bias: shadow.prefiltered(*data, size=3, **bias),
     "pcf": lambda *data, **bias: shadow.pcf(*data, **SOFT, kernel="tent", **bias),
-    "edge_pcf": lambda *data, **bias: shadow.edge_pcf(*data, **SOFT, mask="depth", **bias),
+    "edge_pcf": lambda *data, **bias: shadow.edge_pcf(*data, **SOFT, edges="depth", **bias),
     "pcss": lambda *data, **bias: shadow.pcss(*data, LIGHT, light_size=0.4, **SOFT, **bias),
     "variance": lambda *data, **bias: shadow.variance(*data, size=3, **bias),
 }

@@ -1,7 +1,5 @@
 """Comparison with a shadow map: alone, before filtering and after it."""
 
-import inspect
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,37 +99,6 @@ def test_a_map_smaller_than_the_filter(map_shape):
     np.testing.assert_allclose(
         shadow.pcf(*case, size=7, bias=0.0), naive_pcf(*case, 7), atol=1e-15
     )
-
-
-@pytest.mark.parametrize("size", [0, 2, 4, -3, 3.0, True])
-@pytest.mark.parametrize("name", ["pcf", "prefiltered"])
-def test_a_size_that_is_not_odd_is_refused(case, name, size):
-    function = inspect.unwrap(getattr(shadow, name))
-    with pytest.raises(ValueError, match=rf"`{name}\(size=...\)` must be an odd number"):
-        function(*case, size=size)
-
-
-def test_other_faults_name_their_argument(case):
-    pcf = inspect.unwrap(shadow.pcf)
-    shadow_map, receivers = case
-    faults = {
-        "shadow_map": ((shadow_map[0], receivers), {}),
-        "receivers": ((shadow_map, receivers._replace(u=receivers.u[:2])), {}),
-        "kernel=...": (case, {"kernel": "disc"}),
-        "softness=...": (case, {"softness": 0.0}),
-        "bias=...": (case, {"bias": np.zeros(2)}),
-    }
-    for name, (data, options) in faults.items():
-        with pytest.raises(ValueError) as caught:
-            pcf(*data, size=3, **options)
-        assert str(caught.value).startswith(f"`pcf({name})`")
-
-
-def test_an_integer_map_is_read_as_depths():
-    _, receivers = noise()
-    whole = np.random.default_rng(1).integers(1, 4, (14, 17))
-    found, expected = (shadow.pcf(m, receivers, size=3) for m in (whole, whole.astype(float)))
-    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

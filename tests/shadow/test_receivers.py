@@ -150,7 +150,7 @@ def test_points_beside_and_behind_the_light_have_finite_gradients():
 SOFT = {
     "pcf": lambda texels, seen, light, **given: shadow.pcf(texels, seen, softness=0.5, **given),
     "edge_pcf": lambda texels, seen, light, **given: shadow.edge_pcf(
-        texels, seen, softness=0.5, mask="depth", **given
+        texels, seen, softness=0.5, edges="depth", **given
     ),
     "pcss": lambda texels, seen, light, **given: shadow.pcss(
         texels, seen, light, softness=0.5, light_size=0.3, **given

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfx.shadow._windows import extremes, unions
+from jaxfx.shadow._edges import extremes, unions
 from tests.helpers.forms import first
 
 
