@@ -344,7 +344,7 @@ found = fit.lights(
     boxes.gbuffer,
     boxes.eye,
     start,
-    visibility=boxes.shadows,
+    visibilities=boxes.shadows,
     rounds=len(boxes.scales),
     loss="squares",
     progress=False,

@@ -204,7 +204,7 @@ CALLS = {
     "fit.camera": (
         ft.partial(fit.camera, **QUIET),
         {
-            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "source": CAMERA},
+            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "camera": CAMERA},
             **{"start": CAMERA, "hole_threshold": 0.1},
         },
     ),
@@ -212,7 +212,7 @@ CALLS = {
         ft.partial(fit.lights, **QUIET),
         {
             **{"reference": IMAGE, "gbuffer": CACHE, "camera": CAMERA, "lights": [LIGHT]},
-            **{"visibility": [LIT], "rounds": 1},
+            **{"visibilities": [LIT], "rounds": 1},
         },
     ),
     "fit.MovingShadow": (
@@ -235,7 +235,13 @@ CALLS = {
             **{"visibilities": [LIT]},
         },
     ),
-    "budget.reproject": (budget.reproject, PAIR | {"max_error": 0.1}),
+    "budget.reproject": (
+        budget.reproject,
+        {
+            **{"images": [IMAGE], "depths": [DEPTH], "cameras": [CAMERA], "target": CAMERA},
+            **{"height": 8, "width": 9, "max_error": 0.1},
+        },
+    ),
     "budget.accumulate": (
         ft.partial(budget.accumulate, lambda eye: IMAGE),
         {"camera": CAMERA, "lens": LENS, "max_error": 0.1},

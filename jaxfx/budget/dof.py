@@ -81,7 +81,7 @@ def dof(
     lens: Lens,
     *,
     max_error: Number,
-    target: Literal["scatter", "layered"] = "scatter",
+    effect: Literal["scatter", "layered"] = "scatter",
 ) -> Plan:
     """The quickest depth of field within an error of `dof.scatter`.
 
@@ -107,13 +107,13 @@ def dof(
       or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_error`: root mean square, linear image units, over all pixels and channels.
-    - `target`: the effect that is approached: `dof.scatter` with `gamma=0`, `epsilon=2` and
+    - `effect`: the effect that is approached: `dof.scatter` with `gamma=0`, `epsilon=2` and
       exact kernels, or `dof.layered`, from one layer.
 
     **Returns:** a `Plan`, to be called with `image, depth, lens`, of this scene or of others
     with no larger circles: those are drawn as large as this scene's largest.
 
-    **Raises:** `ValueError` for a wrong shape, a negative `max_error`, an unknown `target` or
+    **Raises:** `ValueError` for a wrong shape, a negative `max_error`, an unknown `effect` or
     traced data.
 
     **Gradient:** none through the choice; the plan's picture has that of what it draws.
@@ -122,16 +122,16 @@ def dof(
     image = check_image("dof(image)", image)
     depth = check_depth("dof(depth)", depth, image.shape[:2])
     check_lens("dof(lens)", lens)
-    option("dof(target=...)", target, ("scatter", "layered"))
+    option("dof(effect=...)", effect, ("scatter", "layered"))
     widest = largest_of("dof", depth, lens)
     if widest is None:
         raise ValueError("`dof(lens)` must be concrete, got a lens that holds traced values.")
-    if widest <= 1 and target == "scatter":
+    if widest <= 1 and effect == "scatter":
         why = f"no circle of confusion passes its pixel: the largest is {widest:.2g} pixels."
         return plan(Method("nothing"), 0.0, 0.0, float("nan"), [f"all, for {why}"])
 
     largest = largest_coc("dof", depth, lens)
-    ways = _Ways(target, (depth.shape[0], depth.shape[1]), largest)
+    ways = _Ways(effect, (depth.shape[0], depth.shape[1]), largest)
     data = (image, depth, lens)
     search = Search(ways.effect(largest), data, max_error, _parts(*data, largest))
     if search.trial(Method("nothing"), "all blur").error > max_error:

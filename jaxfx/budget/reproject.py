@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxfx._checks import Number, check_image, parameter
+from jaxfx._checks import Number, WholeNumber, check_image, parameter, whole_number
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.budget._plan import Plan, Search, check_call
@@ -40,12 +40,15 @@ class Seen(NamedTuple):
 class Everything(eqx.Module):
     """`reproject.blend` of all sources."""
 
-    shape: tuple[int, int] | None = eqx.field(static=True)
+    height: int | None = eqx.field(static=True)
+    width: int | None = eqx.field(static=True)
     title: ClassVar[str] = "reprojection"
 
-    def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
+    def __call__(self, images: Any, depths: Any, cameras: Any, target: Any) -> Any:
         """As the effect."""
-        return blend(images, depths, sources, target, shape=self.shape)
+        if self.height is None or self.width is None:
+            return blend(images, depths, cameras, target)
+        return blend(images, depths, cameras, target, shape=(self.height, self.width))
 
 
 class Blend(eqx.Module):
@@ -56,9 +59,9 @@ class Blend(eqx.Module):
     max_steps: int | None = eqx.field(static=True, default=None)
     title: ClassVar[str] = "reprojection, tile by tile"
 
-    def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
+    def __call__(self, images: Any, depths: Any, cameras: Any, target: Any) -> Any:
         """As the effect."""
-        parts = _chosen(self.parts, images, depths, sources)
+        parts = _chosen(self.parts, images, depths, cameras)
         seen = _seen(parts, target, self.shape, self.max_steps)
         color, known = _blended(seen, self.shape[0] * self.shape[1])
         known = known.astype(color.dtype)
@@ -68,10 +71,11 @@ class Blend(eqx.Module):
 def reproject(
     images: Sequence[Float[ArrayLike, "height width channel"]],
     depths: Sequence[Num[ArrayLike, "height width"]],
-    sources: Sequence[PinholeCamera],
+    cameras: Sequence[PinholeCamera],
     target: PinholeCamera | OrthographicCamera,
     *,
-    shape: tuple[int, int] | None = None,
+    height: WholeNumber | None = None,
+    width: WholeNumber | None = None,
     max_error: Number,
 ) -> Plan:
     """The fewest rays within an error of `reproject.blend` of all sources, "pyramid".
@@ -89,26 +93,27 @@ def reproject(
 
     **Arguments:**
 
-    - `images`, `depths`, `sources`: lists, as in `reproject.blend`; pictures height width
+    - `images`, `depths`, `cameras`: lists, as in `reproject.blend`; pictures height width
       channel, linear radiance, and their depths, height width, scene units.
     - `target`: the camera to see them from.
-    - `shape`: static; height and width of the result in pixels, the first picture's by default.
+    - `height`, `width`: static; of the result, in pixels, both or none: the first image's by
+      default.
     - `max_error`: root mean square, linear image units, over all pixels and channels; where
       nothing is known the picture is 0.
 
-    **Returns:** a `Plan`, to be called with `images, depths, sources, target`, as many sources
+    **Returns:** a `Plan`, to be called with `images, depths, cameras, target`, as many sources
     as there are here, alike in size; it gives image and alpha, as `reproject.blend` does.
 
     **Raises:** `ValueError` as `reproject.blend`, for a negative `max_error` or traced data.
 
     **Gradient:** none through the choice; the plan's picture has that of what it draws.
     """
-    data = check_sources("reproject", images, depths, sources, target)
-    images, depths, sources, _ = data
+    data = check_sources("reproject", images, depths, cameras, target)
+    images, depths, cameras, _ = data
     max_error = check_call("reproject", max_error, data)
-    search = Search(Everything(shape), data, max_error)
-    height, width = search.whole[1].shape[:2]
-    size = (height, width)
+    search = Search(Everything(*_sides(height, width)), data, max_error)
+    rows, columns = search.whole[1].shape[:2]
+    size = (rows, columns)
     uses, steps, most = _needed(*data, size, max_error)
     texts = []
     if not uses.all():
@@ -119,12 +124,22 @@ def reproject(
         longer = np.mean(steps[uses] > most)
         texts.append(f"steps of a ray after {most}, which {longer:.2g} of the rays would take")
     if texts and uses.any():
-        parts = blocks(uses, list(zip(images, depths, sources, strict=True)), steps)
+        parts = blocks(uses, list(zip(images, depths, cameras, strict=True)), steps)
         search.trial(Blend(parts, size, most), "; ".join(texts))
     return search.plan()
 
 
-def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> list[Any]:
+def _sides(height: Any, width: Any) -> tuple[int, int] | tuple[None, None]:
+    """Height and width as positive integers, or None for both."""
+    if height is None and width is None:
+        return None, None
+    return (
+        whole_number("reproject(height=...)", height),
+        whole_number("reproject(width=...)", width),
+    )
+
+
+def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, cameras: Any) -> list[Any]:
     """The sources of all parts, with their blocks. A program does not know which they are."""
 
     def source(index: int) -> tuple[Array, Array, PinholeCamera]:
@@ -132,20 +147,20 @@ def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> 
         return (
             check_image("reproject(images)", images[index]),
             depth.astype(working_dtype(depth.dtype)),
-            sources[index],
+            cameras[index],
         )
 
     return [([source(n) for n in part.members], part.item, part.pixels) for part in parts]
 
 
 def _needed(
-    images: Any, depths: Any, sources: Any, target: Any, size: tuple[int, int], max_error: float
+    images: Any, depths: Any, cameras: Any, target: Any, size: tuple[int, int], max_error: float
 ) -> tuple[Bool[np.ndarray, "source pixel"], Int[np.ndarray, "source pixel"], int | None]:
     """Which sources to look at for each pixel, in how many steps, and a bound on the steps."""
-    tile, count = tile_of(size), len(sources)
+    tile, count = tile_of(size), len(cameras)
     everything = np.ones((count, size[0] * size[1]), bool)
-    parts = blocks(everything, list(zip(images, depths, sources, strict=True)))
-    seen = _seen(_chosen(parts, images, depths, sources), target, size, None)
+    parts = blocks(everything, list(zip(images, depths, cameras, strict=True)))
+    seen = _seen(_chosen(parts, images, depths, cameras), target, size, None)
     weights = _weights(seen, everything.shape[1])
     source = np.concatenate(
         [np.repeat(np.array(p.members)[np.asarray(p.item)], p.pixels.shape[1]) for p in parts]

@@ -20,7 +20,7 @@ from jaxfx.fit._pose import exposure_between, reduced, thinned
 from jaxfx.lens import ThinLens
 
 
-Method = Literal["scatter", "layered"]
+Effect = Literal["scatter", "layered"]
 Tone = Literal["linear", "log"]
 Values = dict[str, Array]
 
@@ -98,7 +98,7 @@ class Model(eqx.Module):
     start: Values
     corrects: Float[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
-    method: Method = eqx.field(static=True)
+    effect: Effect = eqx.field(static=True)
     max_coc: int | float = eqx.field(static=True)
 
     def values(self, unknowns: Values) -> Values:
@@ -162,7 +162,7 @@ class Model(eqx.Module):
 
         def draw(aperture, focus, focal):
             lens, image = ThinLens(aperture, focus, focal), self.pictures.image
-            if self.method == "scatter":
+            if self.effect == "scatter":
                 gamma, epsilon, room = values["gamma"], values["epsilon"], self.max_coc
                 drawn = scatter(image, depth, lens, gamma=gamma, epsilon=epsilon, max_coc=room)
             else:

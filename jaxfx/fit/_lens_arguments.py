@@ -10,9 +10,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_lens
-from jaxfx._checks import check, check_depth, check_image, option, parameter
+from jaxfx._checks import check, check_depth, check_image, check_shape, items, option, parameter
 from jaxfx.dof._sprites import POINT_RADIUS
-from jaxfx.fit._lens import DISPARITY, LENS, Method, Pictures, Tone, Values
+from jaxfx.fit._lens import DISPARITY, LENS, Effect, Pictures, Tone, Values
 from jaxfx.lens import ThinLens
 
 
@@ -22,7 +22,7 @@ PARAMETERS = {"scatter": (*LENS, "gamma", "epsilon"), "layered": (*LENS, "thresh
 
 Loss = Literal["robust", "squares"]
 Exposure = Literal["free", "equal"]
-_OPTIONS = {"method": Method, "loss": Loss, "tone": Tone, "exposure": Exposure}
+_OPTIONS = {"effect": Effect, "loss": Loss, "tone": Tone, "exposure": Exposure}
 
 
 def options(**given: Any) -> None:
@@ -65,12 +65,24 @@ def pictures(
             f"got {len(lenses)}."
         )
     if behind is not None:
-        hidden = check_image("dof(behind=...)[0]", behind[0]).astype(image.dtype)
-        behind = hidden, check_depth("dof(behind=...)[1]", behind[1], depth.shape)
+        behind = _behind(behind, image)
     focal = jnp.stack([each.focal_pixels.astype(image.dtype) for each in lenses])
     stacked = jnp.stack([each.astype(image.dtype) for each in references])
     pictures = Pictures(stacked, image, depth, behind, _weights(weights, image), focal)
     return pictures, lenses
+
+
+def _behind(behind: Any, image: Array) -> tuple[Array, Array]:
+    """The second layer's image, in the type of the first's, and its depth."""
+    name, expected = "dof(behind=...)", "a pair of an image and its depth"
+    pair = items(name, behind, expected)
+    if len(pair) != 2:
+        raise ValueError(f"`{name}` must be {expected}, got {len(pair)} items.")
+    hidden, depth = pair
+    hidden = check_image("dof(behind=...)[0]", hidden)
+    check_shape("dof(behind=...)[0]", hidden, image.shape)
+    depth = check_depth("dof(behind=...)[1]", depth, image.shape[:2])
+    return hidden.astype(image.dtype), depth
 
 
 def _weights(weights: Any, image: Array) -> Float[Array, "height width"]:
@@ -112,8 +124,7 @@ def check_moves(
     for lens in lenses:
         circles = [jnp.where(d > 0, lens.circle_of_confusion(d), jnp.nan) for d in depths]
         circles = jnp.stack(circles)
-        # What is no diameter at all is named by the method.
-        if most <= 0 or bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
+        if bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
             continue
         least, largest = (float(each(circles)) for each in (jnp.nanmin, jnp.nanmax))
         raise ValueError(
@@ -124,9 +135,9 @@ def check_moves(
         )
 
 
-def names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]:
+def names(effect: Effect, parameters: Collection[str] | None) -> tuple[str, ...]:
     """The names of the parameters to fit, in the order of `PARAMETERS` and `DISPARITY`."""
-    usual = PARAMETERS[method]
+    usual = PARAMETERS[effect]
     known = usual + DISPARITY
     names = tuple(n for n in known if n in (usual if parameters is None else parameters))
     if not names or (parameters is not None and len(names) != len(parameters)):

@@ -31,11 +31,11 @@ def search_in_rounds(
     rounds: int,
     lights: tuple[Light, ...],
     make: Callable[[Any], Model],
-    visibility: Any,
+    visibilities: Any,
     search: Callable[[Model, tuple[Light, ...]], tuple[End, Array, Array]],
 ) -> tuple[Model, End, Array, Array]:
     """The last round's model, end, weights and noise, with the losses of all."""
-    entries_of = visibility if callable(visibility) else lambda lights, index: visibility
+    entries_of = visibilities if callable(visibilities) else lambda lights, index: visibilities
 
     model = make(entries_of(lights, 0))
     end, weight, noise = search(model, lights)

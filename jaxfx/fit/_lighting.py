@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfx._checks import share
 from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -38,7 +39,7 @@ class Model(eqx.Module):
 
     gbuffer: GBuffer
     camera: _Camera
-    visibility: tuple[Any, ...]  # an entry each: None, an array, or a function
+    visibilities: tuple[Any, ...]  # an entry each: None, an array, or a function
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, lights: Sequence[Light]) -> Float[Array, "height width 3"]:
@@ -46,9 +47,10 @@ class Model(eqx.Module):
 
     def terms(self, lights: Sequence[Light]) -> list[Float[Array, "height width 3"]]:
         """What each light adds to the picture."""
+        name, shape = "lights(visibilities=...)", self.gbuffer.depth.shape
         seen: list[Any] = [
-            entry(light) if callable(entry) else entry
-            for light, entry in zip(lights, self.visibility, strict=True)
+            share(name, entry(light), shape) if callable(entry) else entry
+            for light, entry in zip(lights, self.visibilities, strict=True)
         ]
         draw = functools.partial(shade, self.gbuffer, self.camera)
         return [draw(light, visible) for light, visible in zip(lights, seen, strict=True)]

@@ -84,9 +84,13 @@ class CameraFit(eqx.Module):
     result: optx.RESULTS
 
     @property
-    def uncertainty(self) -> Float[Array, "6"]:
-        """The standard errors, 6: the roots of the covariance's diagonal, in its units."""
-        return jnp.sqrt(jnp.diagonal(self.covariance))
+    def standard_errors(self) -> dict[str, Float[Array, "3"]]:
+        """Roots of the covariance's diagonal, along the axes of the fitted camera.
+
+        `translation`: 3, scene units; `rotation`: 3, radians.
+        """
+        translation, rotation = jnp.split(jnp.sqrt(jnp.diagonal(self.covariance)), 2)
+        return {"translation": translation, "rotation": rotation}
 
     @property
     def wander(self) -> Float[Array, ""]:
@@ -117,7 +121,7 @@ def camera(
     reference: Float[ArrayLike, "rows columns channel"],
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
-    source: PinholeCamera,
+    camera: PinholeCamera,
     start: PinholeCamera,
     *,
     reference_depth: Num[ArrayLike, "rows columns"] | None = None,
@@ -156,9 +160,9 @@ def camera(
 
     - `reference`: rows columns channel, linear radiance: the photograph whose pose is asked.
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the axis of `source`; inf, and what is missing
+    - `depth`: height width, scene units along the axis of `camera`; inf, and what is missing
       (0, negative, NaN), as in `reproject.warp`.
-    - `source`: the camera of `image` and `depth`.
+    - `camera`: the camera of `image` and `depth`.
     - `start`: the reference's camera with its true intrinsics and a pose to start from. Of four
       pairs of photographs of a room with their depth, 160 x 120 pixels, 1.5 to 7.7 degrees and
       5 to 26 cm apart, all were found from the source's own pose: to 0.04 to 0.08 degrees and
@@ -186,7 +190,7 @@ def camera(
     1994, the exponential of a twist; Huber 1964, the loss; Golub & Pereyra 1973, exposure by
     variable projection; the masks, the last blur and the bounds of success are our own.
     """
-    views = _views(reference, reference_depth, image, depth, source, start)
+    views = _views(reference, reference_depth, image, depth, camera, start)
     max_steps = whole_number("camera(max_steps=...)", max_steps)
     check_options("camera", views.reference.shape[:2], "pyramid", hole_threshold)
     option("camera(exposure=...)", exposure, get_args(Exposure))
@@ -297,10 +301,10 @@ def _scale(found: Comparison) -> Float[Array, "2"]:
 
 
 def _views(
-    reference: Any, reference_depth: Any, image: Any, depth: Any, source: Any, start: Any
+    reference: Any, reference_depth: Any, image: Any, depth: Any, camera: Any, start: Any
 ) -> Views:
     """The checked arguments, in the type of `image`."""
-    for name, eye in (("source", source), ("start", start)):
+    for name, eye in (("camera", camera), ("start", start)):
         check_camera(f"camera({name})", eye, PinholeCamera)
     image = check_image("camera(image)", image)
     reference = check_image("camera(reference)", reference)
@@ -320,7 +324,7 @@ def _views(
         check(name, reference_depth, known, "known somewhere")
         reference_depth = reference_depth.astype(image.dtype)
     reference, depth = reference.astype(image.dtype), depth.astype(image.dtype)
-    return Views(reference, reference_depth, image, depth, source, start)
+    return Views(reference, reference_depth, image, depth, camera, start)
 
 
 def _sigmas(side: int) -> list[float]:

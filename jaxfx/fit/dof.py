@@ -14,12 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
-from jaxfx._checks import (
-    Number,
-    WholeNumber,
-    number,
-    whole_number,
-)
+from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._progress import Bar
 from jaxfx.fit import _lens_arguments as read
 from jaxfx.fit._descent import End, Solver, covariance, descend, tiles
@@ -27,7 +22,7 @@ from jaxfx.fit._lens import (
     BINS,
     DISPARITY,
     LENS,
-    Method,
+    Effect,
     Model,
     Residual,
     Tone,
@@ -65,8 +60,8 @@ class DofFit(eqx.Module):
       of radiance; it jumps where the search goes on with other lenses, sizes or weights.
     - `ends`: where the searches on small pictures ended, the best first: the parameters, in
       their units, and the `"loss"` of each.
-    - `uncertainty`: a standard error for each fitted parameter, in its own unit, one for each
-      picture where the parameter has one. It takes the residuals of 8 x 8 tiles of the image
+    - `standard_errors`: by the name of each fitted parameter, in its unit; one for each picture
+      where the parameter has one. It takes the residuals of 8 x 8 tiles of the image
       for independent of one another, and no others. A parameter that the pictures do not tell
       has a large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
@@ -88,7 +83,7 @@ class DofFit(eqx.Module):
     images: Float[Array, "picture height width channel"]
     losses: Float[Array, " steps"]
     ends: tuple[dict[str, Array], ...]
-    uncertainty: dict[str, Float[Array, "*picture"]]
+    standard_errors: dict[str, Float[Array, "*picture"]]
     explained: Float[Array, ""]
     clamped: Float[Array, ""]
     result: optx.RESULTS
@@ -106,10 +101,12 @@ class DofFit(eqx.Module):
     @property
     def untold(self) -> tuple[str, ...]:
         """The fitted parameters whose standard error is half of them or more."""
-        return tuple(name for name, error in self.uncertainty.items() if not self._tells(name))
+        return tuple(
+            name for name, error in self.standard_errors.items() if not self._tells(name)
+        )
 
     def _tells(self, name: str) -> bool:
-        error = np.asarray(self.uncertainty[name], float)
+        error = np.asarray(self.standard_errors[name], float)
         if name == "shift":  # Beside the inverse depths, it may well be 0.
             distances = [np.asarray(lens.focus_distance, float) for lens in self.lenses]
             size = 1 / np.min(distances)
@@ -146,7 +143,7 @@ def dof(
     *,
     gamma: Float[ArrayLike, ""] | float = 1.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
-    method: Method = "scatter",
+    effect: Effect = "scatter",
     threshold: Float[ArrayLike, ""] | float = 2.0,
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
@@ -179,7 +176,7 @@ def dof(
     - `lens`: where the search starts, lengths in scene units, one for each picture;
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
-    - `method`: the one of `jaxfx.dof` whose parameters are sought.
+    - `effect`: the function of `jaxfx.dof` whose parameters are sought.
     - `behind`: the second layer, as in `dof.layered`.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
@@ -210,17 +207,18 @@ def dof(
     noise near edges, the footprint and the lenses that are tried are our own.
     """
     pictures, lenses = read.pictures(reference, image, depth, lens, behind, weights)
-    read.options(method=method, loss=loss, tone=tone, exposure=exposure)
+    read.options(effect=effect, loss=loss, tone=tone, exposure=exposure)
     max_steps = whole_number("dof(max_steps=...)", max_steps)
     start = read.start(lenses, gamma, epsilon, threshold, pictures.image.dtype)
-    names = read.names(method, parameters)
+    names = read.names(effect, parameters)
     if max_coc is not None:
-        max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
+        is_diameter = lambda x: 0 < x < math.inf
+        max_coc = number("dof(max_coc=...)", max_coc, is_diameter, "positive and finite")
     read.check_moves(names, lenses, pictures, max_coc)
     is_robust, is_free = loss == "robust", exposure == "free"
     if is_robust and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
-    model = Model(pictures, start, jnp.zeros(()), names, method, 1.0)
+    model = Model(pictures, start, jnp.zeros(()), names, effect, 1.0)
     with Bar(progress, "fit") as bar:
         solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         residual = functools.partial(plain, exposure=is_free, tone=tone)
@@ -260,10 +258,10 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
     one, is_plain = len(model.pictures.references) == 1, "footprint" not in model.names
     flat = eqx.tree_at(lambda r: r.model.corrects, residual, jnp.zeros(()))
-    uncertainty = {}
+    standard_errors = {}
     for name in (name for name in model.names if name != "footprint"):
         error = jnp.abs(slopes[name].astype(float)) * jnp.sqrt(variances[name])
-        uncertainty[name] = error[0] if one and name in LENS else error
+        standard_errors[name] = error[0] if one and name in LENS else error
     references = model.pictures.references
     middle = jnp.mean(references, axis=(1, 2), keepdims=True)
     contrast = jnp.mean(residual.weighted(references - middle) ** 2)
@@ -276,7 +274,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
         images=drawn if is_plain else evaluate(flat, end.unknowns)[1],
         losses=jnp.stack(end.losses),
         ends=ends,
-        uncertainty=uncertainty,
+        standard_errors=standard_errors,
         explained=jnp.where(contrast > 0, 1 - jnp.mean(rest**2) / contrast, 1) * share,
         clamped=jnp.mean(model.circles(values) > model.max_coc),
         result=end.result,

@@ -51,8 +51,8 @@ class LightsFit(eqx.Module):
     - `losses`: the mean squared residual, as weighted at the time, at the start of each search
       and after every step, in squared units of radiance, always with the best colours where
       colours are fitted. It jumps where the pixels are reweighted.
-    - `uncertainty`: for each light a standard error of every parameter that was fitted, in its
-      own unit: 3 for the colour and the position, an angle in radians for the direction, 2
+    - `standard_errors`: for each light those of the parameters that were fitted, by name, in
+      their units: 3 for the colour and the position, an angle in radians for the direction, 2
       (inner, outer) for the angles. It takes the residuals of 8 x 8 tiles of the image for
       independent of one another, and no others, and is never less than what noise of a
       thousandth of the picture's root mean square would make. inf where the picture has nothing
@@ -77,7 +77,7 @@ class LightsFit(eqx.Module):
     lights: tuple[Light, ...]
     image: Float[Array, "height width 3"]
     losses: Float[Array, " steps"]
-    uncertainty: tuple[dict[str, Float[Array, "..."]], ...]
+    standard_errors: tuple[dict[str, Float[Array, "..."]], ...]
     indistinct: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     untold: tuple[tuple[int, str], ...] = eqx.field(static=True)
     weights: Float[Array, "height width"]
@@ -114,7 +114,7 @@ def lights(
     camera: PinholeCamera | OrthographicCamera,
     lights: Sequence[Light],
     *,
-    visibility: Any = None,
+    visibilities: Any = None,
     weights: Num[ArrayLike, "height width"] | None = None,
     loss: Loss = "robust",
     rounds: WholeNumber = 1,
@@ -145,7 +145,7 @@ def lights(
       shader is -1, a pixel has no say.
     - `lights`: their number and kinds, and where the search starts; colours count only if they
       are not fitted.
-    - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
+    - `visibilities`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
       function of the light that gives that and can be differentiated, a `MovingShadow` say. Or,
       for shadows that are made anew in each round, a function of the lights (those found so
       far) and of the round (0, 1, ...) that gives such entries.
@@ -187,7 +187,7 @@ def lights(
             rounds,
             start,
             lambda given: Model(gbuffer, camera, _entries(given, len(start), shape), names),
-            visibility,
+            visibilities,
             lambda model, lights: search_once(
                 model, lights, reference, given, loss == "robust", descend_on
             ),
@@ -276,14 +276,14 @@ def _names(parameters: Collection[str], lights: tuple[Light, ...]) -> tuple[str,
     return names
 
 
-def _entries(visibility: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
-    """The entries of `visibility`, checked."""
-    name = "lights(visibility=...)"
-    given = [None] * count if visibility is None else visibility
+def _entries(visibilities: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
+    """The entries of `visibilities`, checked."""
+    name = "lights(visibilities=...)"
+    given = [None] * count if visibilities is None else visibilities
     entries = items(name, given, "a sequence of entries, or a function")
     if len(entries) != count:
         raise ValueError(
-            f"`lights(visibility=...)` must have an entry for each of {count} lights, "
+            f"`lights(visibilities=...)` must have an entry for each of {count} lights, "
             f"got {len(entries)}."
         )
     return tuple(
