@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, fit, relight, scene
-from jaxfx.fit import _pose
+from jaxfx.fit import _pose_residual as _pose
 from tests.cases import rooms
 from tests.helpers.forms import first
 
