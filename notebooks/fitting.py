@@ -151,7 +151,9 @@ def soft(view, direction, scale, size=256):
     """The shadow whose texels move with the light, as wide as nine of them."""
     light_camera = sun_camera(direction, view.middle, scale, size)
     depths = scene.depth(view.world, light_camera, height=size, width=size)
-    return fit.MovingShadow(depths, light_camera, view.gbuffer, view.camera, softness=1 / scale)
+    return shadow.MovingShadow(
+        depths, light_camera, view.gbuffer, view.camera, softness=1 / scale
+    )
 
 
 def photograph(view, sun):

@@ -60,7 +60,7 @@ TRANSFER = Transfer(
 RAYS = np.broadcast_to([4.0, 4.0, 0.0], (2, 3)), np.broadcast_to([0.0, 0, 1], (2, 3))
 STATE = relight.start(CACHE, CAMERA, [LIGHT])
 LIT = np.ones(SIZE)
-MOVING = fit.MovingShadow(
+MOVING = shadow.MovingShadow(
     MAP,
     PinholeCamera([[8, 0, 4], [0, 8, 4], [0, 0, 1]], np.eye(4)),
     CACHE,
@@ -72,7 +72,7 @@ MOVING = fit.MovingShadow(
 def _moving_shadow(**arguments):
     """Made below jaxtyping's check: a class' own is about its `__init__`."""
     made = object.__new__(type("Bare", (), {}))
-    inspect.unwrap(fit.MovingShadow.__init__)(made, **arguments)
+    inspect.unwrap(shadow.MovingShadow.__init__)(made, **arguments)
     return [made.occluders, made.receivers]
 
 
@@ -215,14 +215,17 @@ CALLS = {
             **{"visibilities": [LIT], "rounds": 1},
         },
     ),
-    "fit.MovingShadow": (
+    "shadow.MovingShadow": (
         _moving_shadow,
         {
             **{"shadow_map": MAP, "light_camera": CAMERA, "gbuffer": CACHE, "camera": CAMERA},
             **{"softness": 0.1, "size": 3},
         },
     ),
-    "fit.MovingShadow()": (ft.partial(fit.MovingShadow.__call__, MOVING), {"light": LIGHT}),
+    "shadow.MovingShadow()": (
+        ft.partial(shadow.MovingShadow.__call__, MOVING),
+        {"light": LIGHT},
+    ),
     "budget.dof": (
         budget.dof,
         {n: v for n, v in BLUR.items() if n != "max_coc"} | {"max_error": 0.1},

@@ -139,9 +139,9 @@ def lights(
     - `lights`: their number and kinds, and where the search starts; colors matter only if they
       are not fitted.
     - `visibilities`: shadows, one entry per light: None; height width in [0, 1], held fixed; or
-      a differentiable function from the light to that, a `MovingShadow` say. Or, for shadows
-      that are computed in each round, a function of the lights (those found so far) and of the
-      round (0, 1, ...) to such entries.
+      a differentiable function from the light to that, a `shadow.MovingShadow` say. Or, for
+      shadows that are computed in each round, a function of the lights (those found so far) and
+      of the round (0, 1, ...) to such entries.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts,
       besides; 0 leaves a pixel out.
     - `loss`: `"robust"`, or `"squares"`, where pixels count as given: what `robust` takes for
@@ -176,7 +176,7 @@ def lights(
     >>> photograph = relight.shade(gbuffer, camera, DirectionalLight([0, 0, 1], [3, 2, 1]))
     >>> start = [DirectionalLight([0, 0, 1], [1, 1, 1])]
     >>> fitted = fit.lights(photograph, gbuffer, camera, start, parameters=["color"])
-    >>> fitted.lights[0].color.round(3).tolist()
+    >>> [round(value, 3) for value in fitted.lights[0].color.tolist()]
     [3.0, 2.0, 1.0]
 
     The fit is by weighted least squares. The image is linear in the colors: for given

@@ -2,6 +2,7 @@
 
 from jaxfx.shadow.cameras import light_cameras
 from jaxfx.shadow.edge import Candidates, candidates, edge_pcf
+from jaxfx.shadow.moving_shadow import MovingShadow
 from jaxfx.shadow.pcf import hard, pcf, prefiltered
 from jaxfx.shadow.pcss import pcss
 from jaxfx.shadow.receivers import Receivers, receivers
@@ -10,6 +11,7 @@ from jaxfx.shadow.variance import variance
 
 __all__ = [
     "Candidates",
+    "MovingShadow",
     "Receivers",
     "candidates",
     "edge_pcf",
