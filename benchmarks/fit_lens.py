@@ -22,8 +22,8 @@ STARTS = (1.3, 1.15), (0.7, 0.85)
 FREE = ("aperture", "focus_distance")
 METHODS = {
     "scatter": {"parameters": FREE, "gamma": 0.0},
-    "layered": {"method": "layered", "parameters": FREE},
-    "layered, second layer": {"method": "layered", "parameters": FREE},
+    "layered": {"effect": "layered", "parameters": FREE},
+    "layered, second layer": {"effect": "layered", "parameters": FREE},
     "scatter, squares": {"parameters": FREE, "gamma": 0.0, "loss": "squares"},
 }
 
@@ -44,7 +44,7 @@ def fits(case, name, options):
             took = time.perf_counter() - begin
             truth = np.array([float(getattr(lens, each)) for each in FREE])
             miss = np.array([float(getattr(found.lens, each)) for each in FREE]) / truth - 1
-            stated = np.array([float(found.uncertainty[each]) for each in FREE]) / truth
+            stated = np.array([float(found.standard_errors[each]) for each in FREE]) / truth
             yield f"{place}, {largest} pixels", miss, stated, took, found.success
 
 

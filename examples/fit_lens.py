@@ -173,7 +173,7 @@ def print_table(report: dict) -> None:
     print(f"{'':16}{'reference':>12}{'start':>12}{'fitted':>12}{'± std. error':>16}")
     for name in fit.PARAMETERS:
         known = f"{report['true'][name]:12.4g}" if name in report["true"] else f"{'':12}"
-        fitted, error = report[name], report["uncertainty"][name]
+        fitted, error = report[name], report["standard_errors"][name]
         print(f"{name:16}{known}{report['start'][name]:12.4g}{fitted:12.4g}{error:16.2g}")
     print(f"{'PSNR (dB)':28}{report['psnr_start']:12.2f}{report['psnr_fitted']:12.2f}")
     print(f"{'pinhole (dB)':28}{report['psnr_pinhole']:12.2f}")
@@ -283,7 +283,9 @@ def main() -> None:
     report |= {
         "true": numbers(lens),
         "start": numbers(**start),
-        "uncertainty": {name: float(value) for name, value in fitted.uncertainty.items()},
+        "standard_errors": {
+            name: float(value) for name, value in fitted.standard_errors.items()
+        },
         "converged": fitted.success,
         "convergence": float(reference.convergence),
         "largest_coc": coc,

@@ -27,7 +27,7 @@ import numpy as np
 from _begin import fail, make_folder
 from jaxtyping import Array, Float
 
-from jaxfx import dof, fit, relight, reproject, scene, shadow
+from jaxfx import dof, relight, reproject, scene, shadow
 from jaxfx._files import write_whole
 from jaxfx.camera import PinholeCamera
 from jaxfx.gbuffer import GBuffer
@@ -169,7 +169,7 @@ def moving(made: GBuffer, camera: PinholeCamera) -> GBuffer:
 def relit(stage: Stage, gbuffer, camera, light: DirectionalLight, cast: Shadow) -> Image:
     """The picture under the key light and its shadow, and the ambient light."""
     softness = stage.softness
-    visible = fit.MovingShadow(*cast, gbuffer, camera, softness=softness, size=5)(light)
+    visible = shadow.MovingShadow(*cast, gbuffer, camera, softness=softness, size=5)(light)
     key = relight.shade(gbuffer, camera, light, visible)
     return key + relight.shade(gbuffer, camera, AmbientLight(AMBIENT))
 

@@ -1,4 +1,4 @@
-"""Bars on stderr, for calls that are asked to show one."""
+"""Progress bars on stderr, for calls with `progress=True`."""
 
 from collections.abc import Iterable
 from types import TracebackType
@@ -9,7 +9,7 @@ from jaxfx._extras import needs
 
 @final
 class Bar:
-    """A bar that counts steps, or nothing at all; a context.
+    """A progress bar that counts steps, or nothing at all; a context manager.
 
     **Arguments:**
 
@@ -21,7 +21,7 @@ class Bar:
         self._bar = _tqdm()(desc=title, unit="step", leave=False) if is_shown else None
 
     def step(self, **figures: str) -> None:
-        """One step more, and figures to show beside it."""
+        """Count one step, and show figures beside the bar."""
         if self._bar is not None:
             self._bar.update()
             self._bar.set_postfix(**figures)
@@ -40,7 +40,7 @@ class Bar:
 
 
 def counted(items: Iterable[Any], is_shown: bool, title: str) -> Iterable[Any]:
-    """The items, which a bar counts if one is shown."""
+    """The items, counted by a progress bar if `is_shown`."""
     return _tqdm()(items, desc=title, leave=False) if is_shown else items
 
 

@@ -1,4 +1,12 @@
-"""How far a picture is from its reference: PSNR and SSIM, both differentiable."""
+"""Scores of an image against its reference, differentiable.
+
+| I want | call |
+|---|---|
+| decibels of the mean squared error | `metrics.psnr` |
+| the same near silhouettes only | `metrics.psnr(..., mask=...)` |
+| structural similarity, as scikit-image has it | `metrics.ssim` |
+| the same, as its paper has it | `metrics.ssim(..., window="gaussian")` |
+"""
 
 from functools import partial, reduce
 from operator import add
@@ -61,6 +69,13 @@ def psnr(
 
     **Gradient:** exact; zero where the images are equal, since the value is inf there. `mask`
     has none.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import metrics
+    >>> float(metrics.psnr(np.full((8, 8, 3), 0.5), np.full((8, 8, 3), 0.6)).round(1))
+    20.0
     """
     image, reference, data_range = _pair("psnr", image, reference, data_range)
     error = image - reference
@@ -83,11 +98,13 @@ def psnr(
 
 
 def _gaussian(radius: int, sigma: float) -> tuple[float, ...]:
+    """Weights of sum 1 at offsets from `-radius` to `radius` pixels."""
     weights = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     return tuple((weights / weights.sum()).tolist())
 
 
-# The weights of a window along one axis, and the factor on its variances.
+# The weights of a window along one axis, and the factor on its variances: that of 49 samples
+# makes them unbiased; the paper has none.
 _WINDOWS = {
     "uniform": ((1 / 7,) * 7, 49 / 48),
     "gaussian": (_gaussian(5, 1.5), 1.0),
@@ -118,6 +135,14 @@ def ssim(
 
     **Gradient:** exact; zero where the images are equal.
 
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import metrics
+    >>> image = np.random.default_rng(0).random((8, 8, 3))
+    >>> float(metrics.ssim(image, image).round(3))
+    1.0
+
     Source: Wang, Bovik, Sheikh & Simoncelli 2004, eq. 13, with K1 = 0.01 and K2 = 0.03.
     """
     option("ssim(window=...)", window, tuple(_WINDOWS))
@@ -128,29 +153,31 @@ def ssim(
             f"`ssim(image)` must have at least {size} x {size} pixels for the {window} window, "
             f"got {image.shape[0]} x {image.shape[1]}."
         )
-    # Channels beside one another: long rows are quicker than a short last axis.
+    # Channels side by side in a row: long rows are quicker than a short last axis.
     x, y = (a.reshape(a.shape[0], -1) for a in (image, reference))
     fields = jnp.stack([x + y, x - y])
     return jax.jit(_ssim, static_argnums=(2, 3))(fields, data_range, window, image.shape[2])
 
 
 def _taps(values: Array, count: int, axis: int, step: int) -> list[Array]:
-    """`values` as each of `count` neighbours along `axis`, `step` apart, sees it."""
+    """Slices of one size of `values`, `step` apart along `axis`."""
     length = values.shape[axis] - (count - 1) * step
     starts = [i * step for i in range(count)]
     return [lax.slice_in_dim(values, start, start + length, axis=axis) for start in starts]
 
 
 def _mean(values: list[Array], weights: tuple[float, ...]) -> Array:
+    """The weighted sum; `weights` have the sum 1."""
     return reduce(add, [w * value for w, value in zip(weights, values, strict=True)])
 
 
 def _moments(
     fields: Float[Array, "2 h wc"], weights: tuple[float, ...], channels: int
 ) -> tuple[Array, Array]:
-    """Mean and variance over every window, by the law of total variance.
+    """Mean and variance over every window inside, by the law of total variance.
 
-    Unlike a mean of squares less the square of the mean, no difference of large numbers.
+    Unlike a mean of squares less the square of the mean it subtracts no large numbers. `fields`
+    are rows of pixels whose channels lie side by side.
     """
 
     def widen(moments: tuple[Array, Array], axis: int, step: int) -> tuple[Array, Array]:
@@ -161,7 +188,7 @@ def _moments(
         ]
         return mean, _mean(spread, weights)
 
-    # A loop over the fields keeps XLA from fusing one pass into every tap of the next.
+    # A loop over the fields, for XLA would fuse one pass into every tap of the next.
     moments = lax.map(partial(widen, axis=0, step=1), (fields, jnp.zeros_like(fields)))
     return lax.map(partial(widen, axis=1, step=channels), moments)
 
@@ -169,11 +196,11 @@ def _moments(
 def _spread(
     fields: Float[Array, "2 h wc"], weights: tuple[float, ...], channels: int
 ) -> Float[Array, "2 H WC"]:
-    """The transpose of the weighted mean over windows."""
+    """The transpose of the weighted mean over windows: from windows back to pixels."""
 
     def narrow(values: Array, axis: int, step: int) -> Array:
-        reach = (len(weights) - 1) * step
-        margin = [(reach, reach) if i == axis else (0, 0) for i in range(2)]
+        far = (len(weights) - 1) * step
+        margin = [(far, far) if i == axis else (0, 0) for i in range(2)]
         return _mean(_taps(jnp.pad(values, margin), len(weights), axis, step), weights[::-1])
 
     rows = lax.map(partial(narrow, axis=0, step=1), fields)
@@ -193,6 +220,7 @@ def _similarity(means: Array, variances: Array, data_range: Array, unbias: float
 def _ssim(
     fields: Float[Array, "2 h wc"], data_range: Float[Array, ""], window: str, channels: int
 ) -> Float[Array, ""]:
+    """SSIM from the fields x + y and x - y, with a derivative of its own."""
     weights, unbias = _WINDOWS[window]
     return _similarity(*_moments(fields, weights, channels), data_range, unbias)
 
@@ -201,14 +229,14 @@ def _ssim(
 def _ssim_jvp(
     window: str, channels: int, primals: tuple[Array, Array], tangents: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """The gradient written out: a few blurs, where the transpose of slices is many pads."""
+    """The gradient in closed form: a few blurs, where the transpose of slices is many pads."""
     fields, data_range = primals
     weights, unbias = _WINDOWS[window]
     means, variances = _moments(fields, weights, channels)
     similarity = partial(_similarity, unbias=unbias)
     value, pull = jax.vjp(similarity, means, variances, data_range)
     by_mean, by_variance, by_range = pull(jnp.ones_like(value))
-    # By a value, a variance changes by 2 w (value - mean), w its weight in the window.
+    # The derivative of a variance by a value is 2 w (value - mean), w its weight in the window.
     constant = _spread(by_mean - 2 * by_variance * means, weights, channels)
     slope = constant + 2 * fields * _spread(by_variance, weights, channels)
     return value, jnp.sum(slope * tangents[0]) + by_range * tangents[1]

@@ -1,4 +1,12 @@
-"""Speed against accuracy, measured in one run and drawn on one chart."""
+"""Speed or memory against accuracy, measured in one run and drawn on one chart.
+
+| I want | call |
+|---|---|
+| time, memory, PSNR and SSIM of several methods | `tradeoff.measure` |
+| those that no other beats | `tradeoff.pareto` |
+| the chart | `tradeoff.plot` |
+| the chart in a file | `tradeoff.save` |
+"""
 
 import functools
 import io
@@ -36,14 +44,14 @@ Cost = Literal["seconds", "memory"]
 
 
 class Measurement(NamedTuple):
-    """One method on the chart.
+    """The time, memory and accuracy of one method.
 
     - `name`: the method's.
     - `seconds`: median time of a call.
     - `spread`: seconds between the quickest and the slowest call.
     - `psnr`, `ssim`: against the reference, decibels and a ratio.
     - `band_psnr`: decibels inside the mask; NaN where none was given.
-    - `memory`: the largest memory in use beside the arguments and the picture, bytes; NaN where
+    - `memory`: the largest memory in use beside the arguments and the image, bytes; NaN where
       it can't be known.
     """
 
@@ -66,32 +74,42 @@ def measure(
     memory: bool = True,
     progress: bool = False,
 ) -> list[Measurement]:
-    """Time and accuracy of every method, one after another in one process.
+    """Time, memory and accuracy of every method, one after another in one process.
 
-    Each is called once to compile and to give its picture, then timed until it has `repeats`
-    calls or has spent `max_seconds`, once at the least. One whose first call alone takes longer
+    Each is called once to compile and for its image, then timed until it has `repeats` calls or
+    has spent `max_seconds`, once at the least. A method whose first call alone takes longer
     than `max_seconds` is not called again: that call, its compilation included, is its time.
 
     **Arguments:**
 
-    - `methods`: from a name to a function of no arguments that gives an image of the
-      reference's shape; it is waited for.
+    - `methods`: from a name to a function of no arguments that returns an image of the
+      reference's shape; each call is waited for.
     - `reference`: height width channel, linear radiance.
-    - `mask`: height width, the pixels that `band_psnr` is about; those near depth edges, say.
+    - `mask`: height width, the pixels of `band_psnr`: those near edges in depth, say.
     - `repeats`: calls to time, a positive integer.
     - `max_seconds`: of timed calls for each method; a first call over it is the only one.
-    - `memory`: trace each method and compile it once more, to know its memory: that of the
-      program that `jax.jit` makes of it, what it closes over counted as arguments. A method
-      that can't be traced has none to know. One that is compiled already, a
-      `functools.partial` of what `jax.jit(f).lower(...).compile()` gave, is only asked.
+    - `memory`: trace each method and compile it once more for its memory: that of the program
+      that `jax.jit` makes of it, what it closes over counted as arguments. Of a method that
+      can't be traced it is NaN. A `functools.partial` of `jax.jit(f).lower(...).compile()` is
+      compiled already, and not traced.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a list of `Measurement`, in the order of `methods`.
 
-    **Raises:** `ValueError` for no methods, a picture of another shape than the reference's, or
+    **Raises:** `ValueError` for no methods, an image of another shape than the reference's, or
     a number that is out of range.
 
     **Gradient:** none: it measures.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import tradeoff
+    >>> reference = np.ones((8, 8, 3))
+    >>> methods = {"half": lambda: 0.5 * reference, "most": lambda: 0.9 * reference}
+    >>> measured = tradeoff.measure(methods, reference, repeats=1, memory=False)
+    >>> [(m.name, round(m.psnr, 1)) for m in measured]
+    [('half', 6.0), ('most', 20.0)]
     """
     if not methods:
         raise ValueError("`measure(methods)` must hold at least one method, got none.")
@@ -127,12 +145,12 @@ def measure(
 
 
 def _temporary_bytes(method: Callable[[], ArrayLike]) -> float:
-    """What one program of all that a method does holds beside its arguments and its picture."""
+    """Bytes that one program of a method holds beside its arguments and its image."""
     if isinstance(method, functools.partial) and isinstance(method.func, jax.stages.Compiled):
         return _temporary_bytes_of(method.func)
     try:
         closed = jax.make_jaxpr(method)()
-    except Exception:  # It has run before: tracing is what it can't bear.
+    except Exception:  # It ran before, so that it is tracing that fails.
         return math.nan
     if not closed.eqns:  # NumPy did it all.
         return math.nan
@@ -149,33 +167,41 @@ def _temporary_bytes_of(program: jax.stages.Compiled) -> float:
 
 
 def _timed(method: Callable[[], ArrayLike]) -> tuple[Array, float]:
-    """The picture that a method gives and the seconds that it takes."""
+    """The image of a method, and the seconds that it takes."""
     start = time.perf_counter()
     image = jax.numpy.asarray(jax.block_until_ready(method()))
     return image, time.perf_counter() - start
 
 
 def pareto(measurements: Sequence[Measurement], *, cost: Cost = "seconds") -> list[Measurement]:
-    """Those that no other beats in both cost and PSNR, the cheapest first.
+    """The measurements that no other beats in both cost and PSNR, the cheapest first.
 
     **Arguments:**
 
     - `measurements`: a sequence of `Measurement`, of any length.
-    - `cost`: what is to be small: the time, or the memory, of which those that are not known
-      are left out.
+    - `cost`: what is to be small: the time, or the memory; measurements without one are left
+      out.
 
     **Returns:** the front, a list of `Measurement`.
 
     **Raises:** `ValueError` for an unknown `cost`.
 
     **Gradient:** none: it chooses.
+
+    **Example:**
+
+    >>> from jaxfx import tradeoff
+    >>> slow = tradeoff.Measurement("slow", 2.0, 0.0, 30.0, 0.9, 30.0)
+    >>> quick = tradeoff.Measurement("quick", 1.0, 0.0, 35.0, 0.9, 35.0)
+    >>> [m.name for m in tradeoff.pareto([slow, quick])]
+    ['quick']
     """
     _check_cost("pareto", cost)
     front = []
     known = [m for m in measurements if not math.isnan(getattr(m, cost))]
-    for one in sorted(known, key=lambda m: (getattr(m, cost), -m.psnr)):
-        if not front or one.psnr > front[-1].psnr:
-            front.append(one)
+    for measurement in sorted(known, key=lambda m: (getattr(m, cost), -m.psnr)):
+        if not front or measurement.psnr > front[-1].psnr:
+            front.append(measurement)
     return front
 
 
@@ -184,10 +210,10 @@ def _check_cost(caller: str, cost: str) -> None:
         raise ValueError(f"`{caller}(cost=...)` must be one of {get_args(Cost)}, got {cost!r}.")
 
 
-# How a cost is drawn: its unit's size, and what is written below the axis.
+# The unit of each cost on the axis, in seconds or bytes, and the label of the axis.
 _AXES = {
-    "seconds": (1e-3, "time of a picture (ms, median)"),
-    "memory": (1e6, "memory beside arguments and picture (MB)"),
+    "seconds": (1e-3, "time of an image (ms, median)"),
+    "memory": (1e6, "memory beside arguments and image (MB)"),
 }
 
 
@@ -198,25 +224,33 @@ def plot(
     lines: Mapping[str, Sequence[str]] | None = None,
     cost: Cost = "seconds",
 ) -> None:
-    """The chart: milliseconds or megabytes against PSNR, the Pareto front drawn through.
+    """Draw milliseconds or megabytes against PSNR, with the Pareto front.
 
-    Every measurement is a point with its name beside it: filled on the front, hollow where it
-    is beaten. Names keep clear of one another and of the points, at the size that the figure
-    has now. The costs are on a logarithmic axis; if any memory is 0, it is linear below the
-    smallest that is not.
+    Every measurement is a point with its name beside it: filled on the front, hollow where
+    another beats it. Names keep clear of one another and of the points, at the size that the
+    figure has now. The costs are on a logarithmic axis; if any memory is 0, it is linear below
+    the smallest that is not.
 
     **Arguments:**
 
-    - `measurements`: what `measure` gave, a sequence of any length.
+    - `measurements`: the result of `measure`, a sequence of any length.
     - `ax`: the matplotlib axes to draw on.
     - `lines`: from a label to the names to join by a line, one method at several settings. A
-      point is then named by what its name has after the label.
-    - `cost`: what goes along the axis: the time, or the memory, of which those that are not
-      known are left out.
+      point is then named by the rest of its name after the label.
+    - `cost`: the time, or the memory; measurements without one are left out.
 
     **Raises:** `ValueError` for an unknown `cost`.
 
     **Gradient:** none: it draws.
+
+    **Example:**
+
+    >>> from matplotlib.figure import Figure
+    >>> from jaxfx import tradeoff
+    >>> ax = Figure().add_subplot()
+    >>> tradeoff.plot([tradeoff.Measurement("scatter", 0.02, 0.001, 35.0, 0.98, 33.0)], ax)
+    >>> ax.get_ylabel()
+    'PSNR to the reference (dB)'
     """
     _check_cost("plot", cost)
     unit, label = _AXES[cost]
@@ -259,7 +293,7 @@ def plot(
 
 
 def _scale(ax: "Axes", costs: Sequence[float]) -> None:
-    """Logarithmic, or linear below the smallest if there is a 0; with plain numbers."""
+    """Make the axis of costs logarithmic, or linear below the smallest where one is 0."""
     with needs("plot"):
         from matplotlib.ticker import LogLocator
 
@@ -274,8 +308,8 @@ def _scale(ax: "Axes", costs: Sequence[float]) -> None:
     ax.xaxis.set_major_formatter("{x:g}")
 
 
-# The sides of a point that a name may stand on, the better ones first: a direction and how the
-# name is aligned to it.
+# The sides of a point where its name may stand, in order of preference: a direction, and the
+# alignment of the name there.
 _SIDES = (
     (1, 0, "left", "center"),
     (0, 1, "center", "bottom"),
@@ -286,20 +320,20 @@ _SIDES = (
     (-0.7, 0.7, "right", "bottom"),
     (-0.7, -0.7, "right", "top"),
 )
-# The part of a name that lies before the place it is aligned to.
+# The part of a name, a ratio, that lies left of or below the place it is aligned to.
 _PART = {"left": 0, "bottom": 0, "center": 0.5, "right": 1, "top": 1}
-# How far from it, in printer's points; from the third on, a hair line leads there.
+# Distances of a name from its point, in printer's points; from the third on a line leads there.
 _DISTANCES = (6, 11, 18, 28, 40, 54, 70, 90, 115)
 
 
 def _write_names(
     ax: "Axes", texts: Sequence[tuple[str, Point, float, Any]], paths: Sequence[Any]
 ) -> None:
-    """A name beside each point: the first place where it covers nothing, else the least."""
+    """Write a name beside each point, in the first place where it covers nothing, or least."""
     figure = ax.get_figure(root=True)
     if figure is None:
         return
-    figure.draw_without_rendering()  # Until then, nothing has its place.
+    figure.draw_without_rendering()  # It lays out the axes, which have no place before.
     point, legend = figure.dpi / 72, ax.get_legend()
     # Boxes are left, bottom, right and top, in pixels.
     taken = [legend.get_window_extent().extents] if legend else []
@@ -341,14 +375,16 @@ def _write_names(
 
 
 def _shared(boxes: Any, others: Any) -> Any:
-    """The areas in which boxes lie over others."""
+    """The areas, box other, in which boxes overlap others."""
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     return np.maximum(high - low, 0).prod(axis=-1)
 
 
 def save(figure: "Figure", path: StrPath) -> None:
-    """Save a chart, whole or not at all, with its text as text: to be searched and edited.
+    """Save a chart, its text as text that can be searched and edited.
+
+    The file is written whole or not at all.
 
     **Arguments:**
 
@@ -360,6 +396,12 @@ def save(figure: "Figure", path: StrPath) -> None:
     folder does not exist or can't be written.
 
     **Gradient:** none: it writes a file.
+
+    **Example:**
+
+    >>> from matplotlib.figure import Figure
+    >>> from jaxfx import tradeoff
+    >>> tradeoff.save(Figure(), "chart.svg")
     """
     with needs("plot"):
         import matplotlib

@@ -244,7 +244,7 @@ right.grid(alpha=0.3)
 plt.show()
 
 # %% [markdown]
-# `fit.dof(method="layered")` fits it to one picture. The curve is flat and has a hollow or two,
+# `fit.dof(effect="layered")` fits it to one picture. The curve is flat and has a hollow or two,
 # so such a search stays near its start.
 #
 # ## Time and radius

@@ -151,7 +151,9 @@ def soft(view, direction, scale, size=256):
     """The shadow whose texels move with the light, as wide as nine of them."""
     light_camera = sun_camera(direction, view.middle, scale, size)
     depths = scene.depth(view.world, light_camera, height=size, width=size)
-    return fit.MovingShadow(depths, light_camera, view.gbuffer, view.camera, softness=1 / scale)
+    return shadow.MovingShadow(
+        depths, light_camera, view.gbuffer, view.camera, softness=1 / scale
+    )
 
 
 def photograph(view, sun):
@@ -270,7 +272,7 @@ fitted = fit.lights(
     gbuffer,
     camera,
     [AmbientLight(white), wrong],
-    visibility=shadows,
+    visibilities=shadows,
     rounds=len(scales),
     loss="squares",
     progress=False,
@@ -286,4 +288,4 @@ show(photograph=target, start=photograph(still, wrong), fitted=fitted.image)
 # - See an occluder that its light did not see: the first of two things behind one another
 #   hides the second until the map is rendered again.
 # - Know how many lights there are, or that a colour can't be negative: it takes what it is
-#   given and says in `indistinct` and `uncertainty` what the picture could not tell.
+#   given and says in `indistinct` and `standard_errors` what the picture could not tell.

@@ -311,7 +311,7 @@ def hard_loss(direction):
 
 def soft_loss(direction, scale):
     seen = boxes.seen_from(direction, scale)
-    moving = fit.MovingShadow(*seen, boxes.gbuffer, boxes.eye, softness=1 / scale)
+    moving = shadow.MovingShadow(*seen, boxes.gbuffer, boxes.eye, softness=1 / scale)
     return loss(moving(DirectionalLight(direction, [1.0, 1.0, 1.0])))
 
 
@@ -344,7 +344,7 @@ found = fit.lights(
     boxes.gbuffer,
     boxes.eye,
     start,
-    visibility=boxes.shadows,
+    visibilities=boxes.shadows,
     rounds=len(boxes.scales),
     loss="squares",
     progress=False,

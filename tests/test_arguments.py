@@ -60,7 +60,7 @@ TRANSFER = Transfer(
 RAYS = np.broadcast_to([4.0, 4.0, 0.0], (2, 3)), np.broadcast_to([0.0, 0, 1], (2, 3))
 STATE = relight.start(CACHE, CAMERA, [LIGHT])
 LIT = np.ones(SIZE)
-MOVING = fit.MovingShadow(
+MOVING = shadow.MovingShadow(
     MAP,
     PinholeCamera([[8, 0, 4], [0, 8, 4], [0, 0, 1]], np.eye(4)),
     CACHE,
@@ -72,7 +72,7 @@ MOVING = fit.MovingShadow(
 def _moving_shadow(**arguments):
     """Made below jaxtyping's check: a class' own is about its `__init__`."""
     made = object.__new__(type("Bare", (), {}))
-    inspect.unwrap(fit.MovingShadow.__init__)(made, **arguments)
+    inspect.unwrap(shadow.MovingShadow.__init__)(made, **arguments)
     return [made.occluders, made.receivers]
 
 
@@ -209,7 +209,7 @@ CALLS = {
     "fit.camera": (
         ft.partial(fit.camera, **QUIET),
         {
-            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "source": CAMERA},
+            **{"reference": IMAGE, "image": IMAGE, "depth": DEPTH, "camera": CAMERA},
             **{"start": CAMERA, "hole_threshold": 0.1},
         },
     ),
@@ -217,17 +217,20 @@ CALLS = {
         ft.partial(fit.lights, **QUIET),
         {
             **{"reference": IMAGE, "gbuffer": CACHE, "camera": CAMERA, "lights": [LIGHT]},
-            **{"visibility": [LIT], "rounds": 1},
+            **{"visibilities": [LIT], "rounds": 1},
         },
     ),
-    "fit.MovingShadow": (
+    "shadow.MovingShadow": (
         _moving_shadow,
         {
             **{"shadow_map": MAP, "light_camera": CAMERA, "gbuffer": CACHE, "camera": CAMERA},
             **{"softness": 0.1, "size": 3},
         },
     ),
-    "fit.MovingShadow()": (ft.partial(fit.MovingShadow.__call__, MOVING), {"light": LIGHT}),
+    "shadow.MovingShadow()": (
+        ft.partial(shadow.MovingShadow.__call__, MOVING),
+        {"light": LIGHT},
+    ),
     "budget.dof": (
         budget.dof,
         {n: v for n, v in BLUR.items() if n != "max_coc"} | {"max_error": 0.1},
@@ -240,7 +243,13 @@ CALLS = {
             **{"visibilities": [LIT]},
         },
     ),
-    "budget.reproject": (budget.reproject, PAIR | {"max_error": 0.1}),
+    "budget.reproject": (
+        budget.reproject,
+        {
+            **{"images": [IMAGE], "depths": [DEPTH], "cameras": [CAMERA], "target": CAMERA},
+            **{"height": 8, "width": 9, "max_error": 0.1},
+        },
+    ),
     "budget.accumulate": (
         ft.partial(budget.accumulate, lambda eye: IMAGE),
         {"camera": CAMERA, "lens": LENS, "max_error": 0.1},

@@ -129,7 +129,7 @@ def test_memory_is_drawn_in_megabytes(least):
         of_memory("b", 3e6, 30.0),
     ]
     tradeoff.plot(everything, ax, lines={"a": ["a 1", "a 2"]}, cost="memory")
-    assert ax.get_xlabel() == "memory beside arguments and picture (MB)"
+    assert ax.get_xlabel() == "memory beside arguments and image (MB)"
     assert ax.get_xscale() == ("symlog" if least == 0 else "log")
     assert [text.get_text() for text in ax.texts] == ["1", "b"]
     drawn = {tuple(xy) for line in ax.lines for xy in line.get_xydata()}
@@ -194,7 +194,7 @@ def test_the_front_is_drawn_through_the_unbeaten(ax):
 
 
 def test_axes_have_units_and_spreads_are_bars(ax):
-    assert (ax.get_xlabel(), ax.get_xscale()) == ("time of a picture (ms, median)", "log")
+    assert (ax.get_xlabel(), ax.get_xscale()) == ("time of an image (ms, median)", "log")
     assert ax.get_ylabel() == "PSNR to the reference (dB)"
     widths = {np.ptp(bar[:, 0]) for c in ax.collections for bar in c.get_segments()}
     np.testing.assert_allclose(sorted(widths), [0.0, 0.4, 20.0])

@@ -12,7 +12,6 @@ from jaxfx import (
     OrthographicCamera,
     PinholeCamera,
     SpotLight,
-    fit,
     relight,
     scene,
     shadow,
@@ -217,4 +216,4 @@ class Boxes:
         """For `fit.lights`: a finer map in each round, from the sun found so far."""
         scale = self.scales[index]
         seen = self.seen_from(lights[1].direction, scale)
-        return None, fit.MovingShadow(*seen, self.gbuffer, self.eye, softness=1 / scale)
+        return None, shadow.MovingShadow(*seen, self.gbuffer, self.eye, softness=1 / scale)

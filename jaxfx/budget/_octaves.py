@@ -1,4 +1,4 @@
-"""Scatter with large sprites at a lower resolution: a large disc has no detail to lose."""
+"""Scatter with large sprites at lower resolutions: a large disc has little detail to lose."""
 
 import functools as ft
 
@@ -16,6 +16,7 @@ from jaxfx.dof.scatter import cheapest, to_sprites
 from jaxfx.lens import Lens
 
 
+# The epsilon of `dof.scatter` that this stands for, in pixels: its default.
 EPSILON = 2.0
 _KERNELS = {"shift": shift, "tiles": tiles, "spans": spans}
 _Values = Float[Array, "height width value"]
@@ -29,12 +30,12 @@ def octaves(
     max_coc: float,
     split: float,
 ) -> Float[Array, "height width channel"]:
-    """`dof.scatter`, but of sprites wider than `split` four make one, of half the size; again
-    and again, until none is.
+    """`dof.scatter` with gamma 0 and epsilon 2; sprites wider than `split` pixels coarser.
 
-    What they add, in front of the focus and behind it apart, is enlarged again before the
-    quotient is taken; how much of the latter a pixel takes is its own to say, at full size: for
-    sprites of three times epsilon and more, the leak rejection is a factor of the destination.
+    Four sprites wider than `split` become one at half the resolution, and so on until none is
+    wider. The sums that they add, in front of the focus and behind it apart, are enlarged again
+    before the quotient is taken. The leak rejection behind the focus is applied at full size:
+    for sprites of three times epsilon and more it is a factor of the target pixel alone.
     """
     dtype = image.dtype
     image, depth, missing, _, _ = pixels(image, depth, lens)
@@ -60,9 +61,9 @@ def _coarse(
     max_coc: float,
     split: float,
 ) -> Float[Array, "rows columns value"]:
-    """What the large sprites add, at half the resolution, the larger ones at less."""
-    share = large[..., None].astype(value.dtype)
-    pooled = _pooled(jnp.concatenate([value, share * radius[..., None], share], axis=-1))
+    """The sums of the large sprites, at half the resolution; the larger ones drawn coarser."""
+    is_large = large[..., None].astype(value.dtype)
+    pooled = _pooled(jnp.concatenate([value, is_large * radius[..., None], is_large], axis=-1))
     count, max_coc = pooled[..., -1], max_coc / 2
     radius = jnp.where(count > 0, pooled[..., -2] / jnp.maximum(count, 1) / 2, POINT_RADIUS)
     none = jnp.zeros_like(radius)
@@ -76,12 +77,13 @@ def _coarse(
 
 
 def _without(sprites: Sprites, some: Array) -> Sprites:
-    """The other sprites."""
+    """The sprites, those of `some` pixels empty and of the smallest radius."""
     value = jnp.where(some[..., None], 0, sprites.value)
     return sprites._replace(value=value, radius=jnp.where(some, POINT_RADIUS, sprites.radius))
 
 
 def _painted(sprites: Sprites, max_coc: float) -> _Values:
+    """The sums of sprites no wider than `max_coc` pixels, by scatter's quickest kernel."""
     height, width = sprites.radius.shape
     kernel = cheapest(height, width, max_coc)
     return _KERNELS[kernel](sprites, reach(max_coc))
@@ -96,16 +98,16 @@ def _pooled(planes: _Values) -> Float[Array, "rows columns value"]:
 
 
 def _enlarged(planes: Float[Array, "rows columns value"], shape: tuple[int, ...]) -> _Values:
-    """Twice the size, between pixels linearly; cut to `shape`."""
+    """Planes at twice their size, linear between pixels, cut to `shape`."""
     for axis in (0, 1):
         size = planes.shape[axis]
-        ends = [(1, 1) if axis == each else (0, 0) for each in range(3)]
+        ends = [(1, 1) if axis == a else (0, 0) for a in range(3)]
         padded = jnp.pad(planes, ends, mode="edge")
         before, after = (
             jax.lax.slice_in_dim(padded, start, start + size, axis=axis) for start in (0, 2)
         )
-        # A pixel's two halves lie a quarter of its size off its centre.
+        # The two halves of a pixel lie a quarter of its size off its center.
         halves = [0.75 * planes + 0.25 * other for other in (before, after)]
-        double = [n * 2 if axis == each else n for each, n in enumerate(planes.shape)]
+        double = [n * 2 if axis == a else n for a, n in enumerate(planes.shape)]
         planes = jnp.stack(halves, axis=axis + 1).reshape(double)
     return planes[: shape[0], : shape[1]]

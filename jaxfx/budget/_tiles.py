@@ -1,7 +1,8 @@
-"""An error that is spent tile by tile, where it saves most, and what is left to do then.
+"""An error that is spent tile by tile, where it saves most, and the pixels that are left then.
 
-What makes a picture (the lights, the sources) is left out tile by tile. The pixels that each is
-still for go in blocks of one size: a program for them has one shape, however they are spread.
+An image is made of items: lights, or sources of a reprojection. Each is left out of the tiles
+where that costs least. The pixels that an item is still drawn in are put into blocks of one
+size, so that one program draws them, wherever they lie.
 """
 
 from collections.abc import Sequence
@@ -15,21 +16,25 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 
-# The side of a tile, in pixels: a larger one needs more, a smaller one takes more counting.
+# The side of a tile, in pixels: a larger tile draws more pixels than need be, smaller ones take
+# longer to choose from.
 _SIDE = 8
-# Pixels of a block, at the least: fewer would not fill a core. And blocks of a picture, at the
-# most: each looks at its item anew, be it as large as the picture.
+
+# The least number of pixels in a block, since fewer would not fill a core; and the largest
+# number of blocks of an image, since each reads its item again, which may be as large.
 _BLOCK, _BLOCKS = 4096, 24
-# A plan's own picture may round a little otherwise than what it was chosen by.
+
+# The part of the error that is spent, a ratio: the rest is for rounding, which in a plan's own
+# program differs from that of the images it was chosen by.
 _SPENT = 0.999
 
 
 class Blocks(eqx.Module):
-    """Pixels in blocks, each for one of some items that are alike in shape and type.
+    """Pixels in blocks, each block for one of several items that are alike in shape and type.
 
-    - `members`: static; which items these are.
-    - `item`: of each block, its place among them.
-    - `pixels`: row by row; one past the picture's last stands for none.
+    - `members`: static; the indices of the items.
+    - `item`: for each block, the place of its item among them.
+    - `pixels`: indices, row by row; one past the image's last stands for none.
     """
 
     members: tuple[int, ...] = eqx.field(static=True)
@@ -42,14 +47,14 @@ def blocks(
     items: Sequence[Any],
     cost: Int[np.ndarray, "item pixel"] | None = None,
 ) -> tuple[Blocks, ...]:
-    """The pixels that each item is used for, those of like cost in one block.
+    """The pixels that each item is used for, in blocks; those of like cost in one block.
 
-    A block takes as long as the dearest of its pixels.
+    A block takes as long as the costliest of its pixels.
     """
     kinds: dict[str, list[int]] = {}
     for index in np.flatnonzero(uses.any(axis=1)).tolist():
         kinds.setdefault(str(jax.tree.map(jax.typeof, items[index])), []).append(index)
-    size, found = min(max(_BLOCK, uses.shape[1] // _BLOCKS), uses.shape[1]), []
+    size, made = min(max(_BLOCK, uses.shape[1] // _BLOCKS), uses.shape[1]), []
     for members in kinds.values():
         wanted = [np.flatnonzero(uses[index]) for index in members]
         if cost is not None:
@@ -62,14 +67,14 @@ def blocks(
         ]
         item = np.repeat(np.arange(len(members)), [len(pixels) // size for pixels in filled])
         arrays = item, np.concatenate(filled).reshape(-1, size)
-        found.append(
+        made.append(
             Blocks(tuple(members), *(jnp.asarray(array, jnp.int32) for array in arrays))
         )
-    return tuple(found)
+    return tuple(made)
 
 
 def tile_of(shape: tuple[int, int]) -> Int[np.ndarray, " pixel"]:
-    """For every pixel, row by row, the number of its tile of 8 x 8 pixels."""
+    """The index of each pixel's tile, pixels row by row."""
     rows, columns = (np.arange(size) // _SIDE for size in shape)
     return (rows[:, None] * (columns[-1] + 1) + columns[None]).reshape(-1)
 
@@ -86,24 +91,24 @@ def tile_sums(image: Float[Array, "height width channel"]) -> Float[Array, " til
     """The sum over each tile and all channels."""
     image = jnp.sum(image, axis=-1)
     rows, columns = (-(-size // _SIDE) for size in image.shape)
-    room = [
+    margin = [
         (0, count * _SIDE - size)
         for count, size in zip((rows, columns), image.shape, strict=True)
     ]
-    tiles = jnp.pad(image, room).reshape(rows, _SIDE, columns, _SIDE)
+    tiles = jnp.pad(image, margin).reshape(rows, _SIDE, columns, _SIDE)
     return jnp.sum(tiles, axis=(1, 3)).ravel()
 
 
 def spend(
     squares: Float[np.ndarray, "tile level"], max_error: float, size: int
 ) -> Int[np.ndarray, " tile"]:
-    """Up to which level to go in each tile: as many steps as the error allows, cheapest first.
+    """The level to go to in each tile: as many steps as the error allows, cheapest first.
 
     `squares` are the sums of squared errors in a tile at each level, 0 at the first; `size` is
-    how many numbers the picture has.
+    the number of values of the image.
     """
     price = np.diff(squares, axis=1)
-    # A step waits for the dearest before it: so the steps of a tile are taken in order.
+    # A step ranks with the costliest before it, so that the steps of a tile are taken in order.
     order = np.argsort(np.maximum.accumulate(price, axis=1).ravel(), kind="stable")
     spent = np.maximum.accumulate(np.cumsum(price.ravel()[order]))
     steps = np.searchsorted(spent, allowed(max_error, size), side="right")
@@ -113,5 +118,5 @@ def spend(
 
 
 def allowed(max_error: float, size: int) -> float:
-    """The sum of squared errors that a picture of so many numbers may have."""
+    """The sum of squared errors that an image of `size` values may have."""
     return (_SPENT * max_error) ** 2 * size

@@ -12,24 +12,26 @@ from jax.typing import ArrayLike
 
 from jaxfx._arguments import check_camera, check_lens
 from jaxfx._checks import Number, as_numpy
-from jaxfx.budget._plan import Plan, check_call, plan
+from jaxfx.budget._search import check_call, plan
+from jaxfx.budget.plan import Plan
 from jaxfx.camera import PinholeCamera
 from jaxfx.dof.accumulate import accumulate as passes
 from jaxfx.lens import ThinLens
 
 
-# Passes whose variance tells how many would do.
+# Passes that are rendered to estimate the variance of one. With fewer the estimate is poor, and
+# the error with it; they are the price of the plan.
 _PILOT = 16
 
 
 class Passes(eqx.Module):
-    """`dof.accumulate` of some passes."""
+    """`dof.accumulate` of a number of passes."""
 
     samples: int = eqx.field(static=True)
     title: ClassVar[str] = "depth of field by passes"
 
     def __call__(self, render: Any, camera: Any, lens: Any) -> Any:
-        """As the effect; the picture alone."""
+        """The image of `dof.accumulate`, alone."""
         return passes(render, camera, lens, samples=self.samples, progress=False).image
 
 
@@ -40,25 +42,36 @@ def accumulate(
     *,
     max_error: Number,
 ) -> Plan:
-    """The passes of `dof.accumulate` that bring it within an error of infinitely many.
+    """The number of passes that brings `dof.accumulate` within an error of infinitely many.
 
-    Sixteen passes are rendered, whose variance in each pixel, over the number of passes, is the
-    squared error of the mean of as many points of the lens taken at random. Those of
-    `dof.accumulate` are spread more evenly than that, and so err less. The sixteen are what it
-    costs.
+    Costs sixteen passes.
 
     **Arguments:**
 
-    - `render`, `camera`, `lens`: as in `dof.accumulate`; pictures height width channel.
+    - `render`, `camera`, `lens`: as in `dof.accumulate`; images height width channel.
     - `max_error`: positive; root mean square, linear image units, over all pixels and channels.
 
-    **Returns:** a `Plan`, to be called with `render, camera, lens`; it gives the picture. Its
+    **Returns:** a `Plan`, to be called with `render, camera, lens`; it gives the image. Its
     error is an estimate, and its time that of one pass, times their number.
 
     **Raises:** `ValueError` as `dof.accumulate`, for a `max_error` that is not positive or
     traced data.
 
     **Gradient:** that of `dof.accumulate`; none through the number of passes.
+
+    **Example:** a scene that looks alike from everywhere needs one pass.
+
+    >>> import numpy as np
+    >>> from jaxfx import PinholeCamera, ThinLens, budget
+    >>> render = lambda camera: np.ones((8, 8, 3))
+    >>> camera = PinholeCamera.from_fov(1.0, height=8, width=8)
+    >>> plan = budget.accumulate(render, camera, ThinLens(0.1, 2.0, 8.0), max_error=0.01)
+    >>> plan.recipe.samples
+    1
+
+    Sixteen passes are rendered. Their variance per pixel, over a number of passes, is the
+    squared error of the mean of as many points of the lens taken at random. Those of
+    `dof.accumulate` are spread more evenly than that, and so err less.
 
     Source: the variance of a mean; Cook, Porter & Carpenter 1984 sample the lens so.
     """
@@ -69,19 +82,19 @@ def accumulate(
     max_error = check_call("accumulate", max_error, (camera, lens))
     if max_error == 0:
         raise ValueError("`accumulate(max_error=...)` must be positive, got 0.")
-    pictures, seconds = [], []
+    images, seconds = [], []
 
-    def kept(eye: PinholeCamera) -> ArrayLike:
+    def recorded(camera: PinholeCamera) -> ArrayLike:
         started = time.perf_counter()
-        picture = as_numpy("accumulate(render)", render(eye))
-        pictures.append(picture.astype(np.float64))
+        image = as_numpy("accumulate(render)", render(camera))
+        images.append(image.astype(np.float64))
         seconds.append(time.perf_counter() - started)
-        return pictures[-1]
+        return images[-1]
 
-    passes(kept, camera, lens, samples=_PILOT, progress=False)
-    variance = float(np.var(pictures, axis=0, ddof=1).mean())
+    passes(recorded, camera, lens, samples=_PILOT, progress=False)
+    variance = float(np.var(images, axis=0, ddof=1).mean())
     samples = max(1, math.ceil(variance / max_error**2))
     text = f"passes beyond {samples}, for the variance of one is {variance:.2g}."
     error = math.sqrt(variance / samples)
-    one = statistics.median(seconds)
-    return plan(Passes(samples), error, samples * one, float("nan"), [text])
+    seconds_per_pass = statistics.median(seconds)
+    return plan(Passes(samples), error, samples * seconds_per_pass, float("nan"), [text])

@@ -10,24 +10,37 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxfx._checks import Number, check_image, parameter
+from jaxfx._checks import Number, WholeNumber, check_image, parameter, whole_number
 from jaxfx._numerics import safe_divide, working_dtype
 from jaxfx._sampling import pixel_centers
-from jaxfx.budget._plan import Plan, Search, check_call
+from jaxfx.budget._search import Search, check_call
 from jaxfx.budget._tiles import Blocks, allowed, blocks, spend, sums, tile_of
+from jaxfx.budget.plan import Plan
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.reproject.blend import Sight, blend, check_sources
 
 
 _OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
-# What a pixel that nobody shows any more adds to the squared error: coverage is kept.
+# What a pixel that no source shows any more adds to the squared error, in squared image units:
+# so much that it is never left out, since a plan keeps the coverage.
 _LOST = 1e30
-# The bounds on a ray's steps that are weighed: whole parts, in so many, of the most it takes.
+
+# The bounds on the steps of a ray that are compared: multiples of this part of the most that
+# any takes. More bounds take longer to compare.
 _BOUNDS = 8
 
 
 class Seen(NamedTuple):
-    """What rays show: for which pixel, its colour, whether, how straight, how far, how late."""
+    """What rays from the target's pixels show of their sources.
+
+    - `pixel`: the index of the pixel, row by row; one past the last for a ray that fills a
+      block.
+    - `color`: the source's color there.
+    - `mask`: whether the ray shows a surface.
+    - `along`: cosine of the angle at which the source's ray meets it.
+    - `z`: depth in the target's camera, in scene units.
+    - `steps`: steps of the ray's traversal.
+    """
 
     pixel: Int[Array, " ray"]
     color: Float[Array, "ray channel"]
@@ -40,25 +53,32 @@ class Seen(NamedTuple):
 class Everything(eqx.Module):
     """`reproject.blend` of all sources."""
 
-    shape: tuple[int, int] | None = eqx.field(static=True)
+    height: int | None = eqx.field(static=True)
+    width: int | None = eqx.field(static=True)
     title: ClassVar[str] = "reprojection"
 
-    def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
-        """As the effect."""
-        return blend(images, depths, sources, target, shape=self.shape)
+    def __call__(self, images: Any, depths: Any, cameras: Any, target: Any) -> Any:
+        """The image and alpha, as `reproject.blend` gives them."""
+        if self.height is None or self.width is None:
+            return blend(images, depths, cameras, target)
+        return blend(images, depths, cameras, target, shape=(self.height, self.width))
 
 
 class Blend(eqx.Module):
-    """`reproject.blend`, of each source in some tiles only, and each ray in few steps."""
+    """`reproject.blend` with each source in some tiles only, and a bound on the steps of rays.
+
+    - `parts`: the pixels for which each source is drawn.
+    - `shape`: height and width of the result, in pixels.
+    """
 
     parts: tuple[Blocks, ...]
     shape: tuple[int, int] = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True, default=None)
     title: ClassVar[str] = "reprojection, tile by tile"
 
-    def __call__(self, images: Any, depths: Any, sources: Any, target: Any) -> Any:
-        """As the effect."""
-        parts = _chosen(self.parts, images, depths, sources)
+    def __call__(self, images: Any, depths: Any, cameras: Any, target: Any) -> Any:
+        """Image and alpha, called like `reproject.blend`."""
+        parts = _chosen(self.parts, images, depths, cameras)
         seen = _seen(parts, target, self.shape, self.max_steps)
         color, known = _blended(seen, self.shape[0] * self.shape[1])
         known = known.astype(color.dtype)
@@ -68,47 +88,62 @@ class Blend(eqx.Module):
 def reproject(
     images: Sequence[Float[ArrayLike, "height width channel"]],
     depths: Sequence[Num[ArrayLike, "height width"]],
-    sources: Sequence[PinholeCamera],
+    cameras: Sequence[PinholeCamera],
     target: PinholeCamera | OrthographicCamera,
     *,
-    shape: tuple[int, int] | None = None,
+    height: WholeNumber | None = None,
+    width: WholeNumber | None = None,
     max_error: Number,
 ) -> Plan:
-    """The fewest rays within an error of `reproject.blend` of all sources, "pyramid".
+    """The fewest rays within an error of `reproject.blend` of all sources.
 
-    The effect is drawn once, each source apart. In every tile of 8 x 8 pixels the sources are
-    left out one after another, from the one that has the least share on, for as long as every
-    pixel that was known is known; over the whole picture those first that cost the least error.
-    Rays of like length are traversed together, as a block takes the steps of its longest; and
-    what error is left goes to the least bound on steps, of seven, by which every pixel is still
-    known: a ray that needs more shows nothing. What is left is drawn and measured against the
-    effect.
-
-    It costs two renderings of all sources, one for the proof and one apart, one by the plan,
-    and about one more to weigh what is left out.
+    For a new view of a scene from many images. A plan is for one target; where it leaves out
+    sources, those need not be rendered.
 
     **Arguments:**
 
-    - `images`, `depths`, `sources`: lists, as in `reproject.blend`; pictures height width
+    - `images`, `depths`, `cameras`: lists, as in `reproject.blend`; images height width
       channel, linear radiance, and their depths, height width, scene units.
     - `target`: the camera to see them from.
-    - `shape`: static; height and width of the result in pixels, the first picture's by default.
+    - `height`, `width`: static; of the result, in pixels, both or none: the first image's by
+      default.
     - `max_error`: root mean square, linear image units, over all pixels and channels; where
-      nothing is known the picture is 0.
+      nothing is known the image is 0.
 
-    **Returns:** a `Plan`, to be called with `images, depths, sources, target`, as many sources
+    **Returns:** a `Plan`, to be called with `images, depths, cameras, target`, as many sources
     as there are here, alike in size; it gives image and alpha, as `reproject.blend` does.
 
     **Raises:** `ValueError` as `reproject.blend`, for a negative `max_error` or traced data.
 
-    **Gradient:** none through the choice; the plan's picture has that of what it draws.
+    **Gradient:** none through the choice; the plan's image has that of what it draws.
+
+    **Example:** of two sources that show the same, one is left out.
+
+    >>> import numpy as np
+    >>> from jaxfx import PinholeCamera, budget
+    >>> camera = PinholeCamera.from_fov(1.0, height=8, width=8)
+    >>> image, depth = np.ones((8, 8, 3), np.float32), np.full((8, 8), 2.0, np.float32)
+    >>> data = [image, image], [depth, depth], [camera, camera], camera
+    >>> plan = budget.reproject(*data, max_error=0.01)
+    >>> float(plan.predicted_error) <= 0.01, plan(*data)[0].shape
+    (True, (8, 8, 3))
+
+    The effect is drawn once, each source apart. In every tile of 8 x 8 pixels sources are left
+    out one after another, from the one of least weight on, for as long as every pixel that was
+    known is known; over the whole image those first that cost the least error. Rays of like
+    length are traversed together, as a block takes the steps of its longest. What error is left
+    goes to the least bound on steps, of seven, under which every pixel is still known: a ray
+    that needs more shows nothing. The rest is drawn and measured against the effect.
+
+    It costs two renderings of all sources, one for the proof and one apart, one by the plan,
+    and about one more to compare what is left out.
     """
-    data = check_sources("reproject", images, depths, sources, target)
-    images, depths, sources, _ = data
+    data = check_sources("reproject", images, depths, cameras, target)
+    images, depths, cameras, _ = data
     max_error = check_call("reproject", max_error, data)
-    search = Search(Everything(shape), data, max_error)
-    height, width = search.whole[1].shape[:2]
-    size = (height, width)
+    search = Search(Everything(*_sides(height, width)), data, max_error)
+    rows, columns = search.whole[1].shape[:2]
+    size = (rows, columns)
     uses, steps, most = _needed(*data, size, max_error)
     texts = []
     if not uses.all():
@@ -119,42 +154,55 @@ def reproject(
         longer = np.mean(steps[uses] > most)
         texts.append(f"steps of a ray after {most}, which {longer:.2g} of the rays would take")
     if texts and uses.any():
-        parts = blocks(uses, list(zip(images, depths, sources, strict=True)), steps)
+        parts = blocks(uses, list(zip(images, depths, cameras, strict=True)), steps)
         search.trial(Blend(parts, size, most), "; ".join(texts))
     return search.plan()
 
 
-def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, sources: Any) -> list[Any]:
-    """The sources of all parts, with their blocks. A program does not know which they are."""
+def _sides(height: Any, width: Any) -> tuple[int, int] | tuple[None, None]:
+    """Height and width as positive integers, or None for both."""
+    if height is None and width is None:
+        return None, None
+    return (
+        whole_number("reproject(height=...)", height),
+        whole_number("reproject(width=...)", width),
+    )
+
+
+def _chosen(parts: Sequence[Blocks], images: Any, depths: Any, cameras: Any) -> list[Any]:
+    """The sources of all parts, with their blocks: a program is told no indices of sources."""
 
     def source(index: int) -> tuple[Array, Array, PinholeCamera]:
         depth = parameter("reproject(depths)", depths[index], None)
         return (
             check_image("reproject(images)", images[index]),
             depth.astype(working_dtype(depth.dtype)),
-            sources[index],
+            cameras[index],
         )
 
     return [([source(n) for n in part.members], part.item, part.pixels) for part in parts]
 
 
 def _needed(
-    images: Any, depths: Any, sources: Any, target: Any, size: tuple[int, int], max_error: float
+    images: Any, depths: Any, cameras: Any, target: Any, size: tuple[int, int], max_error: float
 ) -> tuple[Bool[np.ndarray, "source pixel"], Int[np.ndarray, "source pixel"], int | None]:
-    """Which sources to look at for each pixel, in how many steps, and a bound on the steps."""
-    tile, count = tile_of(size), len(sources)
+    """The sources that each pixel needs, the steps of their rays, and a bound on the steps.
+
+    Without a bound that saves any, the last is None.
+    """
+    tile, count = tile_of(size), len(cameras)
     everything = np.ones((count, size[0] * size[1]), bool)
-    parts = blocks(everything, list(zip(images, depths, sources, strict=True)))
-    seen = _seen(_chosen(parts, images, depths, sources), target, size, None)
+    parts = blocks(everything, list(zip(images, depths, cameras, strict=True)))
+    seen = _seen(_chosen(parts, images, depths, cameras), target, size, None)
     weights = _weights(seen, everything.shape[1])
     source = np.concatenate(
         [np.repeat(np.array(p.members)[np.asarray(p.item)], p.pixels.shape[1]) for p in parts]
     )
-    # A ray that is there to fill a block is for the pixel after the last.
+    # The last column is of rays that fill a block.
     shares = np.zeros((count, everything.shape[1] + 1))
     steps = np.zeros(shares.shape, np.int32)
     shares[source, seen.pixel], steps[source, seen.pixel] = weights, seen.steps
-    # The place of each source in its tile, the one with the largest share first.
+    # The rank of each source in a tile, the one of the largest weight first.
     place = np.argsort(np.argsort(-sums(shares[:, :-1], tile), axis=1), axis=1)
     tile_of_ray = np.append(tile, 0)[seen.pixel]
     own = place[tile_of_ray, source]
@@ -173,9 +221,12 @@ def _needed(
 
 @eqx.filter_jit
 def _seen(parts: list[Any], target: Any, size: tuple[int, int], max_steps: int | None) -> Seen:
-    """What all rays show, block after block."""
+    """What all rays show, block after block.
+
+    `parts` are those of `_chosen`, `size` is height and width of the result.
+    """
     options = _OPTIONS | {"max_steps": max_steps}
-    points, found = pixel_centers(*size).reshape(-1, 2), []
+    points, shown = pixel_centers(*size).reshape(-1, 2), []
     for members, *of_each in parts:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
@@ -188,14 +239,14 @@ def _seen(parts: list[Any], target: Any, size: tuple[int, int], max_steps: int |
             return Seen(pixels, color, view.mask, along, z, view.steps)
 
         rays = jax.lax.map(block, tuple(of_each))
-        found.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays))
+        shown.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays))
     joined = lambda *each: jnp.concatenate([x.astype(each[0].dtype) for x in each])
-    return jax.tree.map(joined, *found)
+    return jax.tree.map(joined, *shown)
 
 
 @eqx.filter_jit
 def _weights(seen: Seen, count: int) -> Float[Array, " ray"]:
-    """How much each ray counts in its pixel, as in `reproject.blend`."""
+    """The weight of each ray in its pixel, as in `reproject.blend`; `count` pixels."""
     z = jnp.where(seen.mask, seen.z, jnp.inf)
     nearest = jnp.full(count, jnp.inf, z.dtype).at[seen.pixel].min(z, mode="drop")
     nearest = nearest.at[seen.pixel].get(mode="clip")
@@ -205,7 +256,7 @@ def _weights(seen: Seen, count: int) -> Float[Array, " ray"]:
 
 @eqx.filter_jit
 def _blended(seen: Seen, count: int) -> tuple[Float[Array, "pixel channel"], Array]:
-    """The mean colour of each pixel, and whether it has one."""
+    """The mean color of each pixel, and whether it has one."""
     weight = _weights(seen, count).astype(seen.color.dtype)[:, None]
     color = jnp.where(weight > 0, seen.color, 0) * weight
     both = jnp.concatenate([color, weight], axis=-1)
@@ -217,13 +268,14 @@ def _blended(seen: Seen, count: int) -> tuple[Float[Array, "pixel channel"], Arr
 def _squares(
     seen: Seen, place: np.ndarray, kept: np.ndarray, size: tuple[int, int]
 ) -> Float[np.ndarray, "level pixel"]:
-    """For every number of places that is kept, the squared error that each pixel makes."""
+    """The squared error of each pixel where rays of `place` below each of `kept` are drawn."""
     places, levels = jnp.asarray(place, jnp.int32), jnp.asarray(kept, jnp.int32)
     return np.asarray(_errors(seen, places, levels, size[0] * size[1]), np.float64)
 
 
 @eqx.filter_jit
 def _errors(seen: Seen, place: Array, kept: Array, count: int) -> Array:
+    """As `_squares`, level pixel."""
     color, known = _blended(seen, count)
 
     def square(kept):

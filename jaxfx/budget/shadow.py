@@ -12,8 +12,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
 from jaxfx._checks import Number, WholeNumber, parameter
-from jaxfx.budget._plan import Plan, Search, Trial, check_call, plan, timed
+from jaxfx.budget._search import Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend
+from jaxfx.budget.plan import Plan
 from jaxfx.shadow.arguments import filter_arguments
 from jaxfx.shadow.compare import mean_comparison, set_up
 from jaxfx.shadow.edge import candidates, edge_pcf
@@ -21,15 +22,16 @@ from jaxfx.shadow.pcf import pcf
 from jaxfx.shadow.receivers import Receivers
 
 
-# Pixels that tell how a smaller filter errs.
+# Pixels of the mask from which the error of a smaller filter is estimated; fewer estimate it
+# poorly, more take longer.
 _SOME = 4096
 
 
 class Filter(eqx.Module):
-    """`shadow.pcf`, everywhere or where the mask by depth has it, to the same end.
+    """`shadow.pcf`, everywhere or only in the mask by depth, outside of which it is the same.
 
-    Of size 1 it is `shadow.hard`, and needs no mask. A bias that is left out is what the full
-    filter needs, whatever the size, so that smaller filters differ from it by nothing else.
+    Of size 1 it is `shadow.hard`, and needs no mask. A bias that is None is the default of the
+    full filter, whatever the size, so that smaller filters differ from it by nothing else.
     """
 
     bias: Float[Array, ""] | None
@@ -40,23 +42,23 @@ class Filter(eqx.Module):
 
     @property
     def title(self) -> str:
-        """What it is."""
+        """Its name, for a plan that is printed."""
         if self.size == 1:
             return "hard shadow"
         return f"shadow filtered {'where its edges are' if self.masked else 'everywhere'}"
 
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
-        """As the effect."""
+        """The visibility, called like `shadow.pcf`."""
         data = (shadow_map, receivers, self.bias, self.slope_bias)
         *data, bias, slope_bias, _ = filter_arguments("shadow", *data, size=self.full_size)
-        how = {"size": self.size, "bias": bias, "slope_bias": slope_bias}
+        options = {"size": self.size, "bias": bias, "slope_bias": slope_bias}
         if self.masked and self.size > 1:
-            return edge_pcf(*data, edges="depth", **how)
-        return pcf(*data, **how)
+            return edge_pcf(*data, edges="depth", **options)
+        return pcf(*data, **options)
 
 
 class Picked(eqx.Module):
-    """`shadow.pcf` in some pixels, row by row, the comparison alone in the others."""
+    """`shadow.pcf` in some pixels, by their indices, `shadow.hard` in the others."""
 
     bias: Float[Array, ""] | None
     slope_bias: Float[Array, ""] | None
@@ -65,7 +67,7 @@ class Picked(eqx.Module):
     title: ClassVar[str] = "shadow filtered in some pixels"
 
     def __call__(self, shadow_map: Any, receivers: Any) -> Any:
-        """As the effect."""
+        """The visibility, called like `shadow.pcf`."""
         data = (shadow_map, receivers, self.bias, self.slope_bias)
         data = filter_arguments("shadow", *data, size=self.size)
         return _picked(self.size, self.pixels, *data[:4])
@@ -73,6 +75,7 @@ class Picked(eqx.Module):
 
 @ft.partial(jax.jit, static_argnums=0)
 def _picked(size, pixels, shadow_map, receivers, bias, slope_bias):
+    """The visibility of all pixels, filtered in `pixels`."""
     texels, places, some = _at(size, pixels, shadow_map, receivers, bias, slope_bias)
     soft = mean_comparison(texels, some, None, size, "box")
     result = mean_comparison(texels, places, None, 1, "box").reshape(-1)
@@ -82,14 +85,15 @@ def _picked(size, pixels, shadow_map, receivers, bias, slope_bias):
 
 @ft.partial(jax.jit, static_argnums=0)
 def _squares(size, pixels, *data):
-    """The mean squared errors of all smaller filters in some pixels, from size 1 on."""
+    """The mean squared error in `pixels` of every smaller filter, from size 1 on."""
     texels, _, some = _at(size, pixels, *data)
-    *less, full = (mean_comparison(texels, some, None, n, "box") for n in range(1, size + 1, 2))
-    return [jnp.mean((each - full) ** 2) for each in less]
+    sizes = range(1, size + 1, 2)
+    *smaller, full = (mean_comparison(texels, some, None, n, "box") for n in sizes)
+    return [jnp.mean((visibility - full) ** 2) for visibility in smaller]
 
 
 def _at(size, pixels, shadow_map, receivers, bias, slope_bias):
-    """What is compared: the map, the places of all pixels, and those of some."""
+    """The padded map, the places in it of all receivers, and those of `pixels`."""
     texels, places = set_up(shadow_map, receivers, bias, slope_bias, size)
     some = jax.tree.map(lambda x: x.reshape(-1).at[pixels].get(mode="clip"), places)
     return texels, places, some
@@ -106,15 +110,7 @@ def shadow(
 ) -> Plan:
     """The quickest shadow within an error of `shadow.pcf` with a filter of `size`.
 
-    Outside the mask by depth the hard shadow is the filtered one, inside it differs by less
-    than 1: where the square root of the mask's share is within the error, the hard shadow is
-    taken and nothing else is tried. Else the filter is tried in the pixels alone where it makes
-    most of a difference on this scene, which knows no other scene; where the mask has it, if
-    that is less, which costs no error; and the smallest filter that keeps to the error in 4096
-    pixels of the mask.
-
-    It costs one rendering for the proof, one by each way, and about as much as another two to
-    find the mask and the pixels.
+    For a shadow map that is looked up again and again.
 
     **Arguments:**
 
@@ -128,25 +124,45 @@ def shadow(
     **Raises:** `ValueError` as `shadow.pcf`, for a negative `max_error` or traced data.
 
     **Gradient:** none through the choice; the plan's shadow has that of what it draws.
+
+    **Example:** without an occluder nothing is filtered.
+
+    >>> import numpy as np
+    >>> from jaxfx import OrthographicCamera, budget, shadow
+    >>> camera, depth = OrthographicCamera(4.0, [4.0, 4.0], np.eye(4)), np.full((8, 8), 2.0)
+    >>> receivers = shadow.receivers(depth, camera, camera)
+    >>> print(budget.shadow(depth, receivers, size=3, max_error=0.01).recipe.title)
+    hard shadow
+
+    Outside the mask by depth the hard shadow is the filtered one, inside it differs by less
+    than 1: where the square root of the mask's share is within the error, the hard shadow is
+    taken and nothing else is tried. Otherwise the candidates are: the filter in those pixels
+    alone where it makes most of a difference, which holds for this scene only; the filter
+    inside the mask, if that is smaller, which costs no error; and the smallest filter that
+    keeps to the error in 4096 pixels of the mask.
+
+    It costs one rendering for the proof, one by each candidate, and about as much as another
+    two to find the mask and the pixels.
     """
     max_error = check_call("shadow", max_error, (shadow_map, receivers, bias, slope_bias))
-    shadow_map = filter_arguments("shadow", shadow_map, receivers, bias, slope_bias, size=size)[
-        0
-    ]
-    given = lambda name, each: None if each is None else parameter(f"shadow({name}=...)", each)
-    biases, size = (given("bias", bias), given("slope_bias", slope_bias)), int(size)
+    arguments = filter_arguments("shadow", shadow_map, receivers, bias, slope_bias, size=size)
+    shadow_map = arguments[0]
+    read = lambda name, value: (
+        None if value is None else parameter(f"shadow({name}=...)", value)
+    )
+    biases, size = (read("bias", bias), read("slope_bias", slope_bias)), int(size)
     where = candidates(
         shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1]
     ).where
     share = float(jnp.mean(where))
-    by = lambda less, masked=True: Filter(*biases, size, less, masked)
+    filtered = lambda smaller, masked=True: Filter(*biases, size, smaller, masked)
     data, text = (shadow_map, receivers), "the filter"
     if share**0.5 <= max_error:
         why = f"it can't matter in more than {share:.2%} of the pixels."
-        seconds = timed(by(1), data)[1]
-        return plan(by(1), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
-    search = Search(by(size, False), data, max_error)
-    picked = _pick(search, by(1))
+        seconds = timed(filtered(1), data)[1]
+        return plan(filtered(1), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
+    search = Search(filtered(size, False), data, max_error)
+    picked = _pick(search, filtered(1))
     few = np.count_nonzero(picked < where.size) / where.size
     if few:
         some = f"{text} but in {few:.1%} of the pixels, held fixed"
@@ -154,25 +170,25 @@ def shadow(
     # Fewer pixels, and no mask, can't take longer.
     if not 0 < few < share:
         outside = f"{text} outside of the {share:.1%} of the pixels where it matters"
-        search.measure(by(size), outside)
-    # Filters differ inside the mask alone, and so by how much can be told from some of it.
+        search.measure(filtered(size), outside)
+    # Filters differ inside the mask alone: some of its pixels tell by how much.
     inside = np.flatnonzero(where)
     inside = inside[np.linspace(0, inside.size - 1, min(_SOME, where.size)).astype(int)]
     probed = filter_arguments("shadow", *data, *biases, size=size)[:4]
     for smaller, square in zip(range(1, size, 2), _squares(size, inside, *probed), strict=True):
         less = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
         if (square := share * float(square)) > max_error**2:
-            search.tried.append(Trial(by(smaller), less, (square,), math.inf))
-        elif search.measure(by(smaller), less).error <= max_error:
+            search.tried.append(Trial(filtered(smaller), less, (square,), math.inf))
+        elif search.measure(filtered(smaller), less).error <= max_error:
             break
     return search.plan()
 
 
 def _pick(search: Search, hard: Filter) -> Int[np.ndarray, " pixel"]:
-    """The pixels that need the filter, to whole blocks; those first where it matters most."""
+    """The pixels whose filter is kept for the error, in whole blocks: where it changes most."""
     full = search.whole[1]
     squares = np.square(np.asarray(hard(*search.data) - full, float)).ravel()
-    # All others take no step.
+    # Pixels that do not differ cost nothing.
     differ = np.flatnonzero(squares)
     steps = np.pad(squares[differ, None], ((0, 0), (1, 0)))
     uses = np.zeros((1, full.size), bool)

@@ -10,23 +10,23 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_lens
-from jaxfx._checks import check, check_depth, check_image, option, parameter
+from jaxfx._checks import check, check_depth, check_image, check_shape, items, option, parameter
 from jaxfx.dof._sprites import POINT_RADIUS
-from jaxfx.fit._lens import DISPARITY, LENS, Method, Pictures, Tone, Values
+from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Pictures, Values
+from jaxfx.fit._lens_residual import Tone
 from jaxfx.lens import ThinLens
 
 
-# What is sought by default.
+# The parameters that are sought by default.
 PARAMETERS = {"scatter": (*LENS, "gamma", "epsilon"), "layered": (*LENS, "threshold")}
-
 
 Loss = Literal["robust", "squares"]
 Exposure = Literal["free", "equal"]
-_OPTIONS = {"method": Method, "loss": Loss, "tone": Tone, "exposure": Exposure}
+_OPTIONS = {"effect": Effect, "loss": Loss, "tone": Tone, "exposure": Exposure}
 
 
 def options(**given: Any) -> None:
-    """`ValueError` for a choice that is none."""
+    """`ValueError` for an option that is none of the choices."""
     for name, value in given.items():
         option(f"dof({name}=...)", value, get_args(_OPTIONS[name]))
 
@@ -37,40 +37,58 @@ def pictures(
     """The pictures, checked, in the type of `image`, and their lenses."""
     image = check_image("dof(image)", image)
     depth = check_depth("dof(depth)", depth, image.shape[:2])
-    several = isinstance(reference, list | tuple) and all(np.ndim(x) == 3 for x in reference)
-    given = [*reference] if several else [reference]
-    names = (
-        [f"dof(reference[{at}])" for at in range(len(given))] if several else ["dof(reference)"]
-    )
-    references = [check_image(name, each) for name, each in zip(names, given, strict=True)]
-    for name, each in zip(names, references, strict=True):
-        if each.shape != image.shape:
-            raise ValueError(
-                f"`{name}` must have the image's shape {image.shape}, got {each.shape}."
-            )
-        check(name, each, np.isfinite, "finite")
+    references = _references(reference, image)
     check("dof(image)", image, np.isfinite, "finite")
     check("dof(depth)", depth, lambda v: (v > 0).any(), "known somewhere")
     lenses = tuple(lens) if isinstance(lens, list | tuple) else (lens,)
-    for each in lenses:
-        if not isinstance(each, ThinLens):
-            raise ValueError(f"`dof(lens)` must be a ThinLens, got {type(each).__name__}.")
-        check_lens("dof(lens)", each)
-        check(
-            "dof(lens.aperture)", each.aperture, lambda v: v > 0, "positive to start a search"
-        )
-    if len(lenses) != len(references) or not references:
+    is_positive, expected = lambda v: v > 0, "positive to start a search"
+    for start in lenses:
+        if not isinstance(start, ThinLens):
+            raise ValueError(f"`dof(lens)` must be a ThinLens, got {type(start).__name__}.")
+        check_lens("dof(lens)", start)
+        check("dof(lens.aperture)", start.aperture, is_positive, expected)
+    if len(lenses) != len(references):
         raise ValueError(
             f"`dof(lens)` must be one for each of {len(references)} pictures, "
             f"got {len(lenses)}."
         )
     if behind is not None:
-        hidden = check_image("dof(behind=...)[0]", behind[0]).astype(image.dtype)
-        behind = hidden, check_depth("dof(behind=...)[1]", behind[1], depth.shape)
-    focal = jnp.stack([each.focal_pixels.astype(image.dtype) for each in lenses])
-    stacked = jnp.stack([each.astype(image.dtype) for each in references])
-    pictures = Pictures(stacked, image, depth, behind, _weights(weights, image), focal)
-    return pictures, lenses
+        behind = _behind(behind, image)
+    focal_pixels = jnp.stack([start.focal_pixels.astype(image.dtype) for start in lenses])
+    weights = _weights(weights, image)
+    return Pictures(references, image, depth, behind, weights, focal_pixels), lenses
+
+
+def _references(reference: Any, image: Array) -> Float[Array, "picture height width channel"]:
+    """One photograph or a list of them, stacked, in the type of `image`."""
+    is_list = isinstance(reference, list | tuple) and all(np.ndim(x) == 3 for x in reference)
+    given = [*reference] if is_list else [reference]
+    if not given:
+        raise ValueError("`dof(reference)` must be at least one photograph, got none.")
+    references = []
+    for index, value in enumerate(given):
+        name = f"dof(reference[{index}])" if is_list else "dof(reference)"
+        photograph = check_image(name, value)
+        if photograph.shape != image.shape:
+            raise ValueError(
+                f"`{name}` must have the image's shape {image.shape}, got {photograph.shape}."
+            )
+        check(name, photograph, np.isfinite, "finite")
+        references.append(photograph.astype(image.dtype))
+    return jnp.stack(references)
+
+
+def _behind(behind: Any, image: Array) -> tuple[Array, Array]:
+    """The second layer's image, in the type of the first's, and its depth."""
+    name, expected = "dof(behind=...)", "a pair of an image and its depth"
+    pair = items(name, behind, expected)
+    if len(pair) != 2:
+        raise ValueError(f"`{name}` must be {expected}, got {len(pair)} items.")
+    hidden, depth = pair
+    hidden = check_image("dof(behind=...)[0]", hidden)
+    check_shape("dof(behind=...)[0]", hidden, image.shape)
+    depth = check_depth("dof(behind=...)[1]", depth, image.shape[:2])
+    return hidden.astype(image.dtype), depth
 
 
 def _weights(weights: Any, image: Array) -> Float[Array, "height width"]:
@@ -104,7 +122,11 @@ def start(
 def check_moves(
     names: Collection[str], lenses: tuple[ThinLens, ...], pictures: Pictures, max_coc: Any
 ) -> None:
-    """`ValueError` for a lens to be found of which no circle of confusion has a derivative."""
+    """`ValueError` where a lens is sought that no derivative moves.
+
+    Circles of confusion below a pixel and above `max_coc` are drawn at those sizes: where all
+    are, neither aperture nor focus distance changes anything.
+    """
     if not set(LENS).intersection(names):
         return
     depths = [pictures.depth] + ([] if pictures.behind is None else [pictures.behind[1]])
@@ -112,10 +134,9 @@ def check_moves(
     for lens in lenses:
         circles = [jnp.where(d > 0, lens.circle_of_confusion(d), jnp.nan) for d in depths]
         circles = jnp.stack(circles)
-        # What is no diameter at all is named by the method.
-        if most <= 0 or bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
+        if bool(((circles > 2 * POINT_RADIUS) & (circles < most)).any()):
             continue
-        least, largest = (float(each(circles)) for each in (jnp.nanmin, jnp.nanmax))
+        least, largest = float(jnp.nanmin(circles)), float(jnp.nanmax(circles))
         raise ValueError(
             "`dof(lens)` must start with a circle of confusion between a pixel and `max_coc` "
             "somewhere, for no other has a derivative that could move the aperture or the "
@@ -124,14 +145,15 @@ def check_moves(
         )
 
 
-def names(method: Method, parameters: Collection[str] | None) -> tuple[str, ...]:
+def names(effect: Effect, parameters: Collection[str] | None) -> tuple[str, ...]:
     """The names of the parameters to fit, in the order of `PARAMETERS` and `DISPARITY`."""
-    usual = PARAMETERS[method]
-    known = usual + DISPARITY
-    names = tuple(n for n in known if n in (usual if parameters is None else parameters))
-    if not names or (parameters is not None and len(names) != len(parameters)):
+    default = PARAMETERS[effect]
+    choices = default + DISPARITY
+    wanted = default if parameters is None else parameters
+    names = tuple(name for name in choices if name in wanted)
+    if not names or len(names) != len(wanted):
         raise ValueError(
-            f"`dof(parameters=...)` must name some of {known}, got {tuple(parameters or ())}."
+            f"`dof(parameters=...)` must name some of {choices}, got {tuple(wanted)}."
         )
     return names
 

@@ -1,4 +1,4 @@
-"""The search for a lens: lenses tried on small pictures, searches there, then on all pixels."""
+"""The search of `fit.dof`: lenses compared and searched on small images, then refined."""
 
 import dataclasses
 import itertools
@@ -12,38 +12,47 @@ from jaxtyping import Array
 
 from jaxfx.dof._inputs import largest_coc
 from jaxfx.fit._descent import End
-from jaxfx.fit._lens import LENS, Model, Residual, Values, evaluate, size, weighed
+from jaxfx.fit._lens_model import LENS, Model, Values
+from jaxfx.fit._lens_noise import weighed
+from jaxfx.fit._lens_residual import Residual, evaluate, mean_size
 
 
-# The lenses that are tried before any search, as factors of the start's, and how many of the
-# best of them are searched from.
-_TRIED = {
+# The lenses that are compared before any search, as factors of the start's, which may be off by
+# as much. Steps are wide enough that neighbours look different and narrow enough that a search
+# from the best reaches the lens.
+_FACTORS = {
     "aperture": (0.5, 0.7, 1.0, 1.4, 2.0),
     "focus_distance": (0.7, 0.8, 0.9, 1.0, 1.12, 1.25, 1.43),
 }
+# From how many of their lowest local minima a search starts: the lowest before a search need
+# not be the lowest after it. Each costs a search on small images.
 _SEARCHES = 2
+
+# Parameters of an effect whose loss may have a minimum on either side, and the factors on the
+# best end from which they are searched again.
 _SOFT, _RESTARTS = ("epsilon", "threshold"), (2.0, 0.5)
 
-# The largest side of the pictures on which searches begin, in pixels, and what the largest
-# circle of confusion must keep there: smaller ones tell no lens.
+# The largest side of the images on which searches begin, in pixels, and what their largest
+# circle of confusion must keep, in pixels: smaller circles show no lens.
 _COARSE, _LEAST_COC = 160, 5.0
 
-# How much larger than the start's largest circle of confusion the lenses that are tried may
-# draw, and how much larger than what was found a search may; how often a search that ran out of
-# room goes on with more.
-_TRIED_ROOM, _ROOM, _ROUNDS = 2.0, 1.25, 4
+# Factors of the largest circle of confusion that is drawn: on the start's, for the lenses that
+# are compared; on that of the last end, for a search. A search whose circles outgrow the bound
+# goes on with a larger one, in as many rounds as the last number says. Larger factors cost
+# time, smaller ones more rounds.
+_TRIED_MARGIN, _MARGIN, _ROUNDS = 2.0, 1.25, 4
 
-# A search whose end is but another's start has converged where a step gains less than this.
+# When a search whose end is another's start has converged: see `descend`.
 _SOON = {"patience": 2, "gain": 1e-3}
 
 
 class Search(NamedTuple):
     """How a lens is sought.
 
-    - `residual`: of plain squares, from a model.
+    - `residual`: from a model, of plain squares.
     - `solve`: `descend` with a solver.
     - `is_robust`: whether noise is estimated and small circles are corrected.
-    - `max_coc`: the largest diameter that may be drawn, in pixels; None for what is needed.
+    - `max_coc`: the largest diameter that may be drawn, in pixels; None for any.
     - `ratios`: the parameters that have one factor for all pictures.
     """
 
@@ -54,113 +63,128 @@ class Search(NamedTuple):
     ratios: tuple[str, ...]
 
     def run(self, model: Model) -> tuple[Residual, End, tuple[Values, ...]]:
-        """The last residual, the end there, and the ends of the searches on small pictures."""
+        """The last residual, where it ended, and the parameters where small images ended.
+
+        Small images, plain squares: compare lenses, search from the best. The same images,
+        edges with a noise of their own: refine the best end. Then the images as given.
+        """
         shrink = _shrink(model)
         pictures = model.pictures if shrink == 1 else model.pictures.shrunk(shrink)
         small = dataclasses.replace(model, pictures=pictures)
-        small = self._with_room(small, model.start, _TRIED_ROOM, shrink)
+        small = self._with_bound(small, model.start, _TRIED_MARGIN, shrink)
         residual = self.residual(small)
-        tried = self._tried(residual)
-        still = _still(small, self.ratios)
-        losses, ends = [jnp.mean(residual.weighted(evaluate(residual, still)[0]) ** 2)], []
-        for unknowns in tried:
+        starts = self._best_starts(residual)
+        origin = _origin(small, self.ratios)
+        losses, ends = [jnp.mean(residual.weighted(evaluate(residual, origin)[0]) ** 2)], []
+        for unknowns in starts:
             ends.append(self._refine(residual, unknowns))
         for name in (name for name in _SOFT if name in model.names):
-            best = _best(residual, ends)[0].unknowns
+            best = _ranked(residual, ends)[0].unknowns
             for factor in _RESTARTS:
                 moved = best | {name: best[name] + math.log(factor)}
                 ends.append(self._refine(residual, moved))
         losses += [loss for end in ends for loss in end.losses]
-        ends = _best(residual, ends)
+        ends = _ranked(residual, ends)
         if self.is_robust:
-            ends[0] = self._refine(residual, ends[0].unknowns, apart=True)
+            ends[0] = self._refine(residual, ends[0].unknowns, has_edges=True)
             losses += ends[0].losses
         full = small if shrink == 1 else model
         residual, end, more = self._finish(full, ends[0].unknowns)
-        told = tuple(
+        reported = tuple(
             small.values(end.unknowns) | {"loss": jnp.asarray(end.losses[-1])} for end in ends
         )
-        return residual, end._replace(losses=losses + more), told
+        return residual, end._replace(losses=losses + more), reported
 
-    def _refine(self, residual: Residual, unknowns: Values, apart: bool = False) -> End:
-        """The end of a search that is but another's start."""
+    def _refine(self, residual: Residual, unknowns: Values, has_edges: bool = False) -> End:
+        """A search whose end is another's start, at the noise of its own start."""
         if self.is_robust:
-            residual = weighed(residual, unknowns, apart)
+            residual = weighed(residual, unknowns, has_edges)
         return self.solve(residual, unknowns, **_SOON)
 
     def _finish(self, model: Model, unknowns: Values) -> tuple[Residual, End, list[Array]]:
-        """The last searches, on the pictures as given, and all their losses."""
+        """The last searches, on the images as given: residual, end, and the losses of all."""
         losses = []
         if self.is_robust:
             model = dataclasses.replace(model, corrects=jnp.ones_like(model.corrects))
         rounds = 0
         while True:
             rounds += 1
-            model = self._with_room(model, model.values(unknowns), _ROOM)
+            model = self._with_bound(model, model.values(unknowns), _MARGIN)
             residual = self.residual(model)
             if self.is_robust:
-                end = self._refine(residual, unknowns, apart=True)
+                end = self._refine(residual, unknowns, has_edges=True)
                 unknowns, losses = end.unknowns, losses + end.losses
                 residual = weighed(residual, unknowns, True)
             end = self.solve(residual, unknowns)
             unknowns, losses = end.unknowns, losses + end.losses
             circles = model.circles(model.values(unknowns))
-            has_room = self.max_coc is not None or not bool((circles > model.max_coc).any())
-            if has_room or rounds == _ROUNDS:
+            is_bounded = self.max_coc is not None
+            fits = is_bounded or not bool((circles > model.max_coc).any())
+            if fits or rounds == _ROUNDS:
                 return residual, end, losses
 
-    def _with_room(self, model: Model, values: Values, room: float, shrink: int = 1) -> Model:
-        """The model that draws circles so much larger than those of these values, at least."""
+    def _with_bound(
+        self, model: Model, values: Values, margin: float, shrink: int = 1
+    ) -> Model:
+        """The model with a `max_coc` of `margin` times the largest circle at these values.
+
+        At least: it is rounded up to half an octave, so that searches from similar starts share
+        their programs. A `max_coc` that the user gave is kept, over the factor of small images.
+        """
         if self.max_coc is not None:
             return dataclasses.replace(model, max_coc=self.max_coc / shrink)
         depth, _ = model.depths(values)
-        number = len(model.pictures.references)
-        lenses = [model.lens(values, picture) for picture in range(number)]
+        count = len(model.pictures.references)
+        lenses = [model.lens(values, picture) for picture in range(count)]
         largest = max(largest_coc("dof", depth, lens) for lens in lenses)
-        if room * largest <= model.max_coc:
+        if margin * largest <= model.max_coc:
             return model
-        # Two steps an octave: searches from near-by starts share their programs.
-        octaves = math.ceil(2 * math.log2(room * largest)) / 2
+        octaves = math.ceil(2 * math.log2(margin * largest)) / 2
         return dataclasses.replace(model, max_coc=2.0**octaves)
 
-    def _tried(self, residual: Residual) -> list[Values]:
-        """The unknowns of the best of the lenses that are tried, at least one."""
+    def _best_starts(self, residual: Residual) -> list[Values]:
+        """The unknowns of the best lenses out of `_FACTORS`, one set for each search.
+
+        Each picture takes its own best lens, unless their ratios are known.
+        """
         model = residual.model
-        still = _still(model, self.ratios)
+        origin = _origin(model, self.ratios)
         names = [name for name in LENS if name in model.names]
         if not names:
-            return [still]
-        factors = [_TRIED[name] for name in names]
+            return [origin]
+        factors = [_FACTORS[name] for name in names]
         points = np.log(list(itertools.product(*factors)))
         points = jnp.asarray(points, float)
-        moved = lambda point: {
-            name: still[name] + value for name, value in zip(names, point, strict=True)
+        at_point = lambda point: {
+            name: origin[name] + value for name, value in zip(names, point, strict=True)
         }
-        found = [size(residual, still | moved(point)) for point in points]
-        found = np.asarray(jnp.stack(found), float)
+        sizes = [mean_size(residual, origin | at_point(point)) for point in points]
+        sizes = np.asarray(jnp.stack(sizes), float)  # point, picture
         if self.ratios:
-            found = np.broadcast_to(found.sum(axis=1, keepdims=True), found.shape)
-        shape = [len(each) for each in factors]
-        order = np.stack([_lowest(column.reshape(shape)) for column in found.T])
-        tried = []
+            sizes = np.broadcast_to(sizes.sum(axis=1, keepdims=True), sizes.shape)
+        table = [len(factor) for factor in factors]
+        order = np.stack([_lowest(column.reshape(table)) for column in sizes.T])
+        starts = []
         for rank in order.T:
-            at = points[rank]  # A point for each picture.
-            shared = lambda name, values: values if still[name].ndim else values[0]
-            columns = zip(names, at.T, strict=True)
-            tried.append(
-                still | {name: still[name] + shared(name, values) for name, values in columns}
-            )
-        return tried
+            chosen = points[rank]  # picture, name
+            start = dict(origin)
+            for name, values in zip(names, chosen.T, strict=True):
+                start[name] = origin[name] + (values if origin[name].ndim else values[0])
+            starts.append(start)
+        return starts
 
 
-def _still(model: Model, ratios: tuple[str, ...]) -> Values:
-    """The unknowns at the start."""
+def _origin(model: Model, ratios: tuple[str, ...]) -> Values:
+    """The unknowns of the user's start, zeros: one per picture where each has its own."""
     shape = lambda name: () if name in ratios else model.start[name].shape
     return {name: jnp.zeros(shape(name), float) for name in model.names}
 
 
 def _lowest(losses: np.ndarray) -> np.ndarray:
-    """The places of the lowest local minima of a table; the lowest again where they are few."""
+    """Flat indices of the `_SEARCHES` lowest local minima of a table, the lowest first.
+
+    Where there are fewer, the last is repeated.
+    """
     padded = np.pad(losses, 1, constant_values=np.inf)
     around = np.lib.stride_tricks.sliding_window_view(padded, (3,) * losses.ndim)
     least = losses <= around.min(axis=tuple(range(losses.ndim, 2 * losses.ndim)))
@@ -169,14 +193,14 @@ def _lowest(losses: np.ndarray) -> np.ndarray:
     return np.pad(places, (0, _SEARCHES - places.size), mode="edge")
 
 
-def _best(residual: Residual, ends: list[End]) -> list[End]:
-    """The ends, those first whose pictures differ least, by their mean absolute differences."""
-    found = np.array([float(jnp.sum(size(residual, end.unknowns))) for end in ends])
-    return [ends[at] for at in np.argsort(np.where(np.isfinite(found), found, np.inf))]
+def _ranked(residual: Residual, ends: list[End]) -> list[End]:
+    """The ends, those first whose images differ least, by the mean absolute difference."""
+    sizes = np.array([float(jnp.sum(mean_size(residual, end.unknowns))) for end in ends])
+    return [ends[at] for at in np.argsort(np.where(np.isfinite(sizes), sizes, np.inf))]
 
 
 def _shrink(model: Model) -> int:
-    """By how much smaller the first pictures are."""
+    """The whole factor by which the first images are smaller."""
     side = max(model.pictures.depth.shape)
     circles = model.circles(model.start)
     largest = float(jnp.max(jnp.where(jnp.isfinite(circles), circles, 0)))

@@ -1,4 +1,10 @@
-"""The search of `fit.lights`: iteratively reweighted least squares."""
+"""The search of `fit.lights`: iteratively reweighted least squares.
+
+Pixels are weighted by the biweight of their residuals, the lights are searched by least squares
+under those weights, and so on. The scale of noise starts at the largest residual and is eased
+down, by at most a half in each reweighting: at a wrong start, weights for the noise itself
+would leave out the pixels that show it to be wrong.
+"""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -11,16 +17,17 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxfx.fit._descent import End, verdict
-from jaxfx.fit._evidence import LEAST_NOISE, brightness, linearized
-from jaxfx.fit._lighting import Model, Residual, Search, best_colors, spread, with_values
+from jaxfx.fit._light_errors import LEAST_NOISE, brightness, linearized
+from jaxfx.fit._light_model import Model, Residual, Search, best_colors, spread, with_values
 from jaxfx.fit._robust import CUT, biweight, lengths, noise_of
 from jaxfx.light import Light
 
 
 _logger = logging.getLogger("jaxfx")
 
-# The most reweightings of a search; the factor by which the estimated noise may fall in each;
-# and the largest change of a weight at which they end.
+# The most reweightings of a search; the largest factor by which the noise may fall in each; and
+# the change of every weight, of 1, below which they end. A larger factor ends sooner, in wrong
+# minima more often; a larger change stops before the weights are those of the noise.
 _REWEIGHTINGS, _EASE, _SETTLED = 32, 2.0, 1e-2
 
 # When a search between two reweightings has converged: see `descend`.
@@ -31,11 +38,14 @@ def search_in_rounds(
     rounds: int,
     lights: tuple[Light, ...],
     make: Callable[[Any], Model],
-    visibility: Any,
+    visibilities: Any,
     search: Callable[[Model, tuple[Light, ...]], tuple[End, Array, Array]],
 ) -> tuple[Model, End, Array, Array]:
-    """The last round's model, end, weights and noise, with the losses of all."""
-    entries_of = visibility if callable(visibility) else lambda lights, index: visibility
+    """The model, end, weights and noise of the last round, with the losses of all.
+
+    `make` takes the entries of `visibilities` to a model, `search` is one round.
+    """
+    entries_of = visibilities if callable(visibilities) else lambda lights, index: visibilities
 
     model = make(entries_of(lights, 0))
     end, weight, noise = search(model, lights)
@@ -54,17 +64,17 @@ def search_once(
     is_robust: bool,
     descend_on: Callable[..., End],
 ) -> tuple[End, Float[Array, "height width"], Float[Array, "2"]]:
-    """One round: an `End` whose unknowns are the lights found; weights and noise of its end."""
-    _say_what_does_not_move(model, lights)
+    """One round: an `End` whose unknowns are lights; the weights and the noise at that end."""
+    _warn_of_what_does_not_move(model, lights)
     search = Search(model, lights, spread(model.gbuffer, model.camera))
     unit = brightness(reference, given)
     unknowns, weight, losses = search.unknowns(), given, []
     noise = jnp.full(2, jnp.inf, reference.dtype)
     is_last = not is_robust
     end = End(unknowns, [], verdict(optx.RESULTS.successful))
-    found = _shown(search, unknowns, reference, jnp.sqrt(given)[..., None])
-    if is_robust:  # What is far off at the start, a lamp in the picture, has no say from then.
-        noise, weight = _reweighted(model, found, reference, given, noise, unit)
+    fitted = _lights(search, unknowns, reference, jnp.sqrt(given)[..., None])
+    if is_robust:  # A lamp in the image, far off from the start, counts little from the first.
+        noise, weight = _reweighted(model, fitted, reference, given, noise, unit)
     for left in reversed(range(_REWEIGHTINGS)):
         root = jnp.sqrt(weight)[..., None]
         is_last = is_last or left == 0
@@ -75,14 +85,14 @@ def search_once(
             end = end._replace(losses=[_mean_square(residual, unknowns)])
         unknowns = end.unknowns
         losses += end.losses
-        found = _shown(search, unknowns, reference, root)
+        fitted = _lights(search, unknowns, reference, root)
         if is_last or end.result != optx.RESULTS.successful:
             break
-        noise, again = _reweighted(model, found, reference, given, noise, unit)
+        noise, again = _reweighted(model, fitted, reference, given, noise, unit)
         is_last = bool(jnp.max(jnp.abs(again - weight)) < _SETTLED * jnp.max(given))
         weight = again
     square = unit.astype(float) ** 2
-    end = End(tuple(found), [loss * square for loss in losses], end.result)
+    end = End(tuple(fitted), [loss * square for loss in losses], end.result)
     return end, weight, noise
 
 
@@ -93,17 +103,17 @@ def _mean_square(residual, unknowns):
 
 @eqx.filter_jit
 def _reweighted(model, lights, reference, given, last, unit):
-    """The noise, which seems to fall by at most a half, and what pixels count with it."""
+    """The noise, no less than half of the `last`, and the weights that follow from it."""
     length = lengths(model(lights) - reference, given)
     is_reached = jnp.any(model.basis(lights) != 0, axis=(0, 3))
-    told = noise_of(length, jnp.where(is_reached, given, 0))
+    estimated = noise_of(length, jnp.where(is_reached, given, 0))
     least = jnp.minimum(last, jnp.max(length, axis=(1, 2)) / CUT) / _EASE
-    noise = jnp.maximum(jnp.maximum(told, least), LEAST_NOISE * unit)
+    noise = jnp.maximum(jnp.maximum(estimated, least), LEAST_NOISE * unit)
     return noise, given * biweight(length, noise)
 
 
-def _shown(search, unknowns, reference, root):
-    """The lights of some unknowns, with their best colours where those are fitted."""
+def _lights(search, unknowns, reference, root):
+    """The lights of some unknowns, with their best colors where those are fitted."""
     lights = _moved(search, unknowns)
     if "color" not in search.model.names:
         return lights
@@ -117,10 +127,10 @@ def _colored(lights: Sequence[Any], colors: np.ndarray) -> list[Any]:
     ]
 
 
-def _say_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None:
-    """Log what of the lights changes nothing in the image; `ValueError` if all of it does."""
+def _warn_of_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None:
+    """Log the parameters that change nothing in the image; `ValueError` if none changes it."""
     values = [model.values(light) for light in lights]
-    # Colours that are fitted are found whatever they were.
+    # Colors that are fitted are found whatever they were: a black one must not count as fixed.
     white = lambda light, own: with_values(
         light, {"color": jnp.ones(3)} if "color" in own else {}
     )

@@ -1,4 +1,4 @@
-"""The lens and the amplifications of pictures with depth of field."""
+"""The lens of photographs with depth of field."""
 
 import functools
 import math
@@ -14,28 +14,14 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
-from jaxfx._checks import (
-    Number,
-    WholeNumber,
-    number,
-    whole_number,
-)
+from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._progress import Bar
 from jaxfx.fit import _lens_arguments as read
-from jaxfx.fit._descent import End, Solver, covariance, descend, tiles
-from jaxfx.fit._lens import (
-    BINS,
-    DISPARITY,
-    LENS,
-    Method,
-    Model,
-    Residual,
-    Tone,
-    evaluate,
-    plain,
-    report,
-    strata,
-)
+from jaxfx.fit._descent import End, Solver, check_success, descend
+from jaxfx.fit._jackknife import covariance, tiles
+from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Model, Values
+from jaxfx.fit._lens_noise import STRATA, strata
+from jaxfx.fit._lens_residual import Residual, Tone, evaluate, plain, report
 from jaxfx.fit._lens_search import Search
 from jaxfx.lens import ThinLens
 
@@ -43,34 +29,36 @@ from jaxfx.lens import ThinLens
 PARAMETERS, LAYERED_PARAMETERS = read.PARAMETERS.values()
 DISPARITY_PARAMETERS = DISPARITY
 
-# A lens is told if its parameters' standard errors are below this share of them, and if so much
-# of the contrast is explained.
+# What a lens must meet to be called a success: the largest standard error, as a ratio to the
+# parameter, and the least ratio of contrast that is explained. Looser bounds trust lenses that
+# the images do not determine, tighter ones doubt more fits of noisy or nearly sharp images.
 _MOST_ERROR, _LEAST_EXPLAINED = 0.5, 0.5
 
 
 @final
 class DofFit(eqx.Module):
-    """What `dof` found.
+    """The lenses and the other parameters that `dof` found, and how sure they are.
 
     - `lenses`: one for each picture, lengths in scene units.
     - `gamma`, `epsilon`, `threshold`, `scale`, `shift`: the other parameters: a number, pixels
-      twice, a ratio and inverse scene units. Frozen ones, and those of the other method, are
-      as they were given.
+      twice, a ratio and inverse scene units. Parameters that were not sought, those of the
+      other effect among them, are as given.
     - `footprint`: a ratio: how far small circles of confusion blur as discs do, which the
-      sprites of the method do not: 0 in pictures made by the method, near 1 in others.
+      sprites of the effect do not: 0 in images made by the effect, near 1 in others.
     - `gain`, `offset`: picture channel, a ratio and units of radiance.
-    - `images`: picture height width channel: what the method draws with all that but gain and
-      offset.
+    - `images`: picture height width channel: what the effect draws with the parameters, before
+      footprint, gain and offset.
     - `losses`: the mean squared residual at the start and after every step, in squared units
       of radiance; it jumps where the search goes on with other lenses, sizes or weights.
-    - `ends`: where the searches on small pictures ended, the best first: the parameters, in
+    - `ends`: where the searches on small images ended, the best first: the parameters, in
       their units, and the `"loss"` of each.
-    - `uncertainty`: a standard error for each fitted parameter, in its own unit, one for each
-      picture where the parameter has one. It takes the residuals of 8 x 8 tiles of the image
-      for independent of one another, and no others. A parameter that the pictures do not tell
-      has a large one, or inf.
+    - `standard_errors`: by the name of each fitted parameter, in its unit; one for each picture
+      where the parameter has one. From a jackknife: the residuals of 8 x 8 tiles of the image
+      are taken for independent of one another, and no others. Of lenses, `scale` and `shift`,
+      the variance by strata of like circles of confusion is added, in which an effect errs
+      alike. A parameter that the pictures do not determine has a large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
-      pixels that have a say, times the share of those.
+      pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
       larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
     - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
@@ -88,7 +76,7 @@ class DofFit(eqx.Module):
     images: Float[Array, "picture height width channel"]
     losses: Float[Array, " steps"]
     ends: tuple[dict[str, Array], ...]
-    uncertainty: dict[str, Float[Array, "*picture"]]
+    standard_errors: dict[str, Float[Array, "*picture"]]
     explained: Float[Array, ""]
     clamped: Float[Array, ""]
     result: optx.RESULTS
@@ -106,11 +94,13 @@ class DofFit(eqx.Module):
     @property
     def untold(self) -> tuple[str, ...]:
         """The fitted parameters whose standard error is half of them or more."""
-        return tuple(name for name, error in self.uncertainty.items() if not self._tells(name))
+        return tuple(
+            name for name, error in self.standard_errors.items() if not self._tells(name)
+        )
 
     def _tells(self, name: str) -> bool:
-        error = np.asarray(self.uncertainty[name], float)
-        if name == "shift":  # Beside the inverse depths, it may well be 0.
+        error = np.asarray(self.standard_errors[name], float)
+        if name == "shift":  # It may well be 0: beside the inverse focus distance.
             distances = [np.asarray(lens.focus_distance, float) for lens in self.lenses]
             size = 1 / np.min(distances)
         elif name in LENS:
@@ -121,7 +111,7 @@ class DofFit(eqx.Module):
 
     @property
     def doubt(self) -> str:
-        """Why the fit is not to be trusted, as a sentence; empty where it is."""
+        """Why the fit is not to be trusted, as a sentence; empty for a success."""
         if self.result != optx.RESULTS.successful:
             return str(self.result)
         if not self.explained > _LEAST_EXPLAINED:
@@ -133,7 +123,7 @@ class DofFit(eqx.Module):
 
     @property
     def success(self) -> bool:
-        """Whether the solver converged, to a lens that the pictures tell."""
+        """Whether the solver converged to a lens that the pictures determine."""
         return not self.doubt
 
 
@@ -146,7 +136,7 @@ def dof(
     *,
     gamma: Float[ArrayLike, ""] | float = 1.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
-    method: Method = "scatter",
+    effect: Effect = "scatter",
     threshold: Float[ArrayLike, ""] | float = 2.0,
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
@@ -162,24 +152,21 @@ def dof(
     throw: bool = True,
     progress: bool = False,
 ) -> DofFit:
-    """The lens and the other parameters that make a method look most like a photograph.
+    """The lens that took a photograph, from an image without blur and its depth.
 
-    Photographs show what one image does not hold: surfaces that near ones hide, and highlights.
-    So the loss is Huber's, and pixels that a sprite from an edge in depth or of the frame
-    reaches count by a noise of their own. First, lenses of half to twice the aperture and 0.7
-    to 1.4 times the focus distance are tried on pictures of at most 160 pixels a side. From the
-    best two, and from half and twice the epsilon or the threshold, a search goes on there; the
-    best end is refined on the pictures as given.
+    Finds aperture and focus distance, and the parameters of `dof.scatter` or `dof.layered` that
+    make the effect look most like the photograph. To measure a lens use `effect="layered"`;
+    scatter takes slanted surfaces for flat ones and finds too small an aperture there.
 
     **Arguments:**
 
-    - `reference`: height width channel, linear radiance: a photograph or a multi-pass picture;
+    - `reference`: height width channel, linear radiance: a photograph or a multi-pass image;
       or a list of several of one scene.
-    - `image`, `depth`: height width channel and height width, as in the method.
+    - `image`, `depth`: height width channel and height width, as in the effect.
     - `lens`: where the search starts, lengths in scene units, one for each picture;
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
-    - `method`: the one of `jaxfx.dof` whose parameters are sought.
+    - `effect`: the function of `jaxfx.dof` whose parameters are sought.
     - `behind`: the second layer, as in `dof.layered`.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
@@ -199,86 +186,109 @@ def dof(
 
     **Returns:** a `DofFit`.
 
-    **Raises:** `ValueError` for what the method refuses, shapes that differ, an unknown or
+    **Raises:** `ValueError` for what the effect refuses, shapes that differ, an unknown or
     empty choice of parameters, a start that can't move (a zero aperture; all circles of
-    confusion below a pixel or above `max_coc`), or a picture that is not finite.
+    confusion below a pixel or above `max_coc`), or an image that is not finite.
     `RuntimeError` where the fit is no success and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
 
+    **Example:** two steps towards the lens of a blurred image.
+
+    >>> import numpy as np
+    >>> from jaxfx import ThinLens, dof, fit
+    >>> image = np.random.default_rng(0).random((12, 12, 1)).astype(np.float32)
+    >>> depth = np.broadcast_to(np.linspace(2, 4, 12, dtype=np.float32), (12, 12))
+    >>> photograph = dof.scatter(image, depth, ThinLens(0.2, 3.0, 40.0), max_coc=4)
+    >>> start, names = ThinLens(0.25, 3.0, 40.0), ["aperture"]
+    >>> options = {"parameters": names, "max_coc": 4, "max_steps": 8, "loss": "squares"}
+    >>> fitted = fit.dof(photograph, image, depth, start, **options)
+    >>> round(float(fitted.lens.aperture), 2)
+    0.2
+
+    Photographs show what one image does not hold: surfaces that near ones hide, and highlights.
+    So the loss is Huber's, and pixels that a sprite from an edge in depth or of the frame
+    reaches have a noise of their own, which is estimated beside that of the others. A pixel
+    that differs by twenty standard deviations is left out. First, lenses of half to twice the
+    aperture and 0.7 to 1.4 times the focus distance are compared on images of at most 160
+    pixels a side. From the best two, and from half and twice the epsilon or the threshold, a
+    search goes on there; the best end is refined on the images as given.
+
     Source: Huber 1964, the loss; Golub & Pereyra 1973, exposure by variable projection. The
-    noise near edges, the footprint and the lenses that are tried are our own.
+    noise near edges, the footprint and the lenses that are compared are our own.
     """
     pictures, lenses = read.pictures(reference, image, depth, lens, behind, weights)
-    read.options(method=method, loss=loss, tone=tone, exposure=exposure)
+    read.options(effect=effect, loss=loss, tone=tone, exposure=exposure)
     max_steps = whole_number("dof(max_steps=...)", max_steps)
     start = read.start(lenses, gamma, epsilon, threshold, pictures.image.dtype)
-    names = read.names(method, parameters)
+    names = read.names(effect, parameters)
     if max_coc is not None:
-        max_coc = number("dof(max_coc=...)", max_coc, lambda x: 0 < x < math.inf)
+        is_diameter = lambda x: 0 < x < math.inf
+        max_coc = number("dof(max_coc=...)", max_coc, is_diameter, "positive and finite")
     read.check_moves(names, lenses, pictures, max_coc)
     is_robust, is_free = loss == "robust", exposure == "free"
     if is_robust and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
-    model = Model(pictures, start, jnp.zeros(()), names, method, 1.0)
+    model = Model(pictures, start, jnp.zeros(()), names, effect, 1.0)
     with Bar(progress, "fit") as bar:
         solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         residual = functools.partial(plain, exposure=is_free, tone=tone)
         search = Search(residual, solve, is_robust, max_coc, read.ratios(ratios))
         fitted = _fitted(*search.run(model))
-    return _checked(fitted) if throw else fitted
-
-
-def _checked(fitted: DofFit) -> DofFit:
-    """The fit, or a `RuntimeError` where it is no success."""
-    if fitted.success:
-        return fitted
-    raise RuntimeError(
-        f"`dof` found no lens in {len(fitted.losses)} steps, the mean squared residual going "
-        f"from {fitted.losses[0]:.3g} to {fitted.losses[-1]:.3g}: {fitted.doubt} "
-        "`throw=False` returns what was reached."
-    )
+    if throw:
+        check_success(fitted, "dof", "lens")
+    return fitted
 
 
 def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) -> DofFit:
-    """The result at the end of a search: parameters, pictures and standard errors."""
+    """The result at the end of a search: parameters, images and standard errors."""
     model = residual.model
     values = model.values(end.unknowns)
     columns, rest, drawn, gain, offset = report(residual, end.unknowns)
-    block, count = tiles(rest.shape[1:])
-    block = jnp.tile(block, rest.shape[0])
-    tree = ravel_pytree(end.unknowns)[1]
-    variances = tree(jnp.diagonal(covariance(columns, rest.reshape(-1), block, count)))
-    if residual.is_robust:
-        # What a method gets wrong biases a lens, which is true or not; gamma, epsilon and
-        # threshold are what makes the method itself look most like the picture.
-        alike = strata(model.circles(values), residual.scale, rest.shape[3])
-        bias = tree(jnp.diagonal(covariance(columns, rest.reshape(-1), alike, 2 * BINS)))
-        for name in {*LENS, *DISPARITY}.intersection(variances):
-            variances[name] = variances[name] + bias[name]
+    variances = _variances(residual, end.unknowns, columns, rest)
     ones = jax.tree.map(jnp.ones_like, end.unknowns)
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
-    one, is_plain = len(model.pictures.references) == 1, "footprint" not in model.names
-    flat = eqx.tree_at(lambda r: r.model.corrects, residual, jnp.zeros(()))
-    uncertainty = {}
+    references = model.pictures.references
+    is_single, is_plain = len(references) == 1, "footprint" not in model.names
+    standard_errors = {}
     for name in (name for name in model.names if name != "footprint"):
         error = jnp.abs(slopes[name].astype(float)) * jnp.sqrt(variances[name])
-        uncertainty[name] = error[0] if one and name in LENS else error
-    references = model.pictures.references
-    middle = jnp.mean(references, axis=(1, 2), keepdims=True)
-    contrast = jnp.mean(residual.weighted(references - middle) ** 2)
+        standard_errors[name] = error[0] if is_single and name in LENS else error
+    without_footprint = eqx.tree_at(lambda r: r.model.corrects, residual, jnp.zeros(()))
+    mean = jnp.mean(references, axis=(1, 2), keepdims=True)
+    contrast = jnp.mean(residual.weighted(references - mean) ** 2)
     share = jnp.mean(jnp.isfinite(residual.scale).astype(contrast.dtype))
     names = ("gamma", "epsilon", "threshold", "scale", "shift", "footprint")
     return DofFit(
         lenses=tuple(model.lens(values, picture) for picture in range(len(references))),
         gain=gain,
         offset=offset,
-        images=drawn if is_plain else evaluate(flat, end.unknowns)[1],
+        images=drawn if is_plain else evaluate(without_footprint, end.unknowns)[1],
         losses=jnp.stack(end.losses),
         ends=ends,
-        uncertainty=uncertainty,
+        standard_errors=standard_errors,
         explained=jnp.where(contrast > 0, 1 - jnp.mean(rest**2) / contrast, 1) * share,
         clamped=jnp.mean(model.circles(values) > model.max_coc),
         result=end.result,
         **{name: values[name] for name in names},
     )
+
+
+def _variances(residual: Residual, unknowns: Values, columns: Array, rest: Array) -> Values:
+    """The variance of each unknown, by leaving out tiles, and strata where an effect is biased.
+
+    What an effect draws wrong biases a lens and a depth, which have true values. It biases
+    `gamma`, `epsilon` and `threshold` by nothing: those are what makes the effect look most
+    like the photograph, and have no others.
+    """
+    flat, tree = rest.reshape(-1), ravel_pytree(unknowns)[1]
+    tile, count = tiles(rest.shape[1:])
+    tile = jnp.tile(tile, rest.shape[0])
+    variances = tree(jnp.diagonal(covariance(columns, flat, tile, count)))
+    if residual.is_robust:
+        circles = residual.model.circles(residual.model.values(unknowns))
+        stratum = strata(circles, residual.scale, rest.shape[3])
+        bias = tree(jnp.diagonal(covariance(columns, flat, stratum, 2 * STRATA)))
+        for name in {*LENS, *DISPARITY}.intersection(variances):
+            variances[name] = variances[name] + bias[name]
+    return variances

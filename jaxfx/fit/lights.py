@@ -1,4 +1,4 @@
-"""The lights of a picture, from it and a deep frame buffer: inverse lighting."""
+"""The lights of a photograph, from it and a G-buffer: inverse lighting."""
 
 from collections.abc import Collection, Sequence
 from functools import partial
@@ -25,18 +25,19 @@ from jaxfx._checks import (
 )
 from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.fit._descent import End, Solver, descend
-from jaxfx.fit._evidence import evidence, linearized
+from jaxfx.fit._descent import End, Solver, check_success, descend
+from jaxfx.fit._light_errors import evidence, linearized
+from jaxfx.fit._light_model import Model, free
 from jaxfx.fit._light_search import search_in_rounds, search_once
-from jaxfx.fit._lighting import Model, free
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import Light
 
 
 LIGHT_PARAMETERS = ("color", "position", "direction", "angles")
 
-# What lights must meet to be trusted, both ratios. With a lower share a few pixels decide; a
-# lower share of the contrast is what lights explain of pictures that they did not light.
+# What lights must meet to be called a success, both ratios: the least share of the weight that
+# counts in the end, and the least contrast that is explained. With a lower first bound a few
+# pixels decide; with a lower second one lights are accepted for images that they did not light.
 _LEAST_SHARE, _LEAST_EXPLAINED = 0.05, 0.7
 
 Loss = Literal["robust", "squares"]
@@ -44,31 +45,32 @@ Loss = Literal["robust", "squares"]
 
 @final
 class LightsFit(eqx.Module):
-    """What `lights` found.
+    """The lights that `lights` found, how sure they are, and how well they explain the image.
 
-    - `lights`: the lights, in the order given; what was frozen as it was.
-    - `image`: height width 3, the picture under them.
+    - `lights`: the lights, in the order given; what was not fitted is as it was.
+    - `image`: height width 3, the cache under them.
     - `losses`: the mean squared residual, as weighted at the time, at the start of each search
-      and after every step, in squared units of radiance, always with the best colours where
-      colours are fitted. It jumps where the pixels are reweighted.
-    - `uncertainty`: for each light a standard error of every parameter that was fitted, in its
-      own unit: 3 for the colour and the position, an angle in radians for the direction, 2
-      (inner, outer) for the angles. It takes the residuals of 8 x 8 tiles of the image for
-      independent of one another, and no others, and is never less than what noise of a
-      thousandth of the picture's root mean square would make. inf where the picture has nothing
-      to say. It knows nothing of other minima.
-    - `indistinct`: groups of lights, by their indices, that the picture can't tell apart: it
+      and after every step, in squared units of radiance, always with the best colors where
+      colors are fitted. It jumps where the pixels are reweighted.
+    - `standard_errors`: for each light those of the parameters that were fitted, by name, in
+      their units: 3 for the color and the position, an angle in radians for the direction, 2
+      (inner, outer) for the angles. From a jackknife: the residuals of 8 x 8 tiles of the image
+      are taken for independent of one another, and no others. Never less than what noise of a
+      thousandth of the image's root mean square would make; inf where the image does not depend
+      on the parameter. Other minima are not in it.
+    - `indistinct`: groups of lights, by their indices, that the image can't tell apart: it
       stays the same, to a thousandth of what each change alone would do, when the parameters of
-      all the group's lights change together; or they are of one kind, and where they are and
-      where to they shine differs by less than three stated errors. Colours of dependent lights
-      are the smallest. What takes part in the change, and the colours, have an error of inf.
-    - `untold`: what has too large an error to be called known, as the index of its light and
-      its name.
+      all lights of the group change together; or they are of one kind, and their positions and
+      directions differ by less than three stated errors. Of colors that fit equally well these
+      are the smallest. The parameters that take part in the change, and the colors of lights
+      that lie so close, have an error of inf.
+    - `untold`: the parameters whose error is too large to call them determined, as the index of
+      their light and their name.
     - `weights`: height width, how much the square of each pixel's difference counted in the
       end.
     - `share`: the share of the given weight, a ratio, that counted in the end, of pixels that
       lights reach.
-    - `explained`: the share of the picture's contrast, a ratio, that is explained: 1 leaves no
+    - `explained`: the share of the image's contrast, a ratio, that is explained: 1 leaves no
       difference, 0 is no better than an even image.
     - `result`: optimistix' verdict on the last search, one of its `RESULTS`; it prints as a
       sentence.
@@ -77,7 +79,7 @@ class LightsFit(eqx.Module):
     lights: tuple[Light, ...]
     image: Float[Array, "height width 3"]
     losses: Float[Array, " steps"]
-    uncertainty: tuple[dict[str, Float[Array, "..."]], ...]
+    standard_errors: tuple[dict[str, Float[Array, "..."]], ...]
     indistinct: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     untold: tuple[tuple[int, str], ...] = eqx.field(static=True)
     weights: Float[Array, "height width"]
@@ -87,15 +89,15 @@ class LightsFit(eqx.Module):
 
     @property
     def doubt(self) -> str:
-        """Why the lights are not to be trusted, as a sentence; empty where they are."""
+        """Why the lights are not to be trusted, as a sentence; empty for a success."""
         if self.result != optx.RESULTS.successful:
             return str(self.result)
         if not self.share >= _LEAST_SHARE:
-            return f"Only {100 * float(self.share):.0f} % of the pixels have a say."
+            return f"Only {100 * float(self.share):.0f} % of the pixels count."
         if not self.explained >= _LEAST_EXPLAINED:
             return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
         if self.indistinct:
-            groups = ["lights " + " and ".join(map(str, each)) for each in self.indistinct]
+            groups = ["lights " + " and ".join(map(str, group)) for group in self.indistinct]
             return f"The picture can't tell apart {'; '.join(groups)}."
         if self.untold:
             names = [f"the {name} of light {index}" for index, name in self.untold]
@@ -104,7 +106,7 @@ class LightsFit(eqx.Module):
 
     @property
     def success(self) -> bool:
-        """Whether the solver converged, to lights that the picture tells."""
+        """Whether the solver converged to lights that the image determines."""
         return not self.doubt
 
 
@@ -114,7 +116,7 @@ def lights(
     camera: PinholeCamera | OrthographicCamera,
     lights: Sequence[Light],
     *,
-    visibility: Any = None,
+    visibilities: Any = None,
     weights: Num[ArrayLike, "height width"] | None = None,
     loss: Loss = "robust",
     rounds: WholeNumber = 1,
@@ -124,31 +126,22 @@ def lights(
     throw: bool = True,
     progress: bool = False,
 ) -> LightsFit:
-    """The lights under which a deep frame buffer looks most like a reference.
+    """The lights of a photograph, from it and a G-buffer of the scene: inverse lighting.
 
-    Weighted least squares. The picture is linear in the colours: for given positions,
-    directions and angles the best ones are solved for, and only the rest is searched (variable
-    projection). Then pixels are reweighted by their residuals, and so on: shadows that the
-    model lacks, highlights that are clipped and unknown materials come to have no say. A weight
-    is Tukey's biweight of a pixel's difference and that of the sum over 5 x 5 about it, each by
-    its noise, which medians tell, and which is eased down, by halves, from what is far off at
-    the start. Huber's loss does not do: a shadow only takes light away, and its pull stays.
-
-    Directions move on the sphere; a cone stays in order by logistic functions. A negative
-    colour says that the model does not fit. The search is local. What changes nothing to begin
-    with, the place of a light that lights nothing say, stays, and the log says so.
+    Finds colors, positions, directions and cones from a start that is near. `success` and
+    `doubt` of the result say whether the image determines them.
 
     **Arguments:**
 
     - `reference`: height width 3, linear radiance.
     - `gbuffer`, `camera`: as in `relight.shade`. Where the depth is missing or inf, or the
-      shader is -1, a pixel has no say.
-    - `lights`: their number and kinds, and where the search starts; colours count only if they
+      shader is -1, a pixel does not count.
+    - `lights`: their number and kinds, and where the search starts; colors matter only if they
       are not fitted.
-    - `visibility`: shadows, one entry a light: None; height width in [0, 1], frozen; or a
-      function of the light that gives that and can be differentiated, a `MovingShadow` say. Or,
-      for shadows that are made anew in each round, a function of the lights (those found so
-      far) and of the round (0, 1, ...) that gives such entries.
+    - `visibilities`: shadows, one entry per light: None; height width in [0, 1], held fixed; or
+      a differentiable function from the light to that, a `shadow.MovingShadow` say. Or, for
+      shadows that are computed in each round, a function of the lights (those found so far) and
+      of the round (0, 1, ...) to such entries.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts,
       besides; 0 leaves a pixel out.
     - `loss`: `"robust"`, or `"squares"`, where pixels count as given: what `robust` takes for
@@ -158,7 +151,7 @@ def lights(
       Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.LIGHT_PARAMETERS`; the others stay as given.
     - `max_steps`: of the solver, each time it starts.
-    - `throw`: raise where the fit is no success; else the failure stands in the result.
+    - `throw`: raise where the fit is no success; else `doubt` says why.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** a `LightsFit`.
@@ -169,13 +162,44 @@ def lights(
 
     **Gradient:** none through the search: it stops at every step to report.
 
-    Source: Golub & Pereyra 1973, variable projection; Schoeneman et al. 1993, colours as a
+    **Example:** the color of a sun.
+
+    >>> import numpy as np
+    >>> from jaxfx import DirectionalLight, GBuffer, PinholeCamera, fit, relight
+    >>> white, normal = np.ones((12, 12, 3)), np.random.default_rng(0).normal(size=(12, 12, 3))
+    >>> normal[..., 2] = -2
+    >>> flat = {"depth": np.full((12, 12), 2.0), "roughness": np.ones((12, 12))}
+    >>> colors = {"color": white, "diffuse": white, "specular": 0 * white, "ambient": white}
+    >>> shader = np.zeros((12, 12), int)
+    >>> gbuffer = GBuffer(shader=shader, normal=normal, **flat, **colors)
+    >>> camera = PinholeCamera.from_fov(1.0, height=12, width=12)
+    >>> photograph = relight.shade(gbuffer, camera, DirectionalLight([0, 0, 1], [3, 2, 1]))
+    >>> start = [DirectionalLight([0, 0, 1], [1, 1, 1])]
+    >>> fitted = fit.lights(photograph, gbuffer, camera, start, parameters=["color"])
+    >>> [round(value, 3) for value in fitted.lights[0].color.tolist()]
+    [3.0, 2.0, 1.0]
+
+    The fit is by weighted least squares. The image is linear in the colors: for given
+    positions, directions and angles the best ones are solved for, and only the rest is searched
+    (variable projection). Then pixels are reweighted by their residuals, and so on: shadows
+    that the model lacks, clipped highlights and unknown materials come to count for nothing.
+    The weight of a pixel is the product of Tukey's biweights of two residuals, its own and the
+    sum over 5 x 5 pixels about it. Each is in units of its noise, which is estimated by
+    medians, and eased down by halves from the largest residual at the start. Huber's loss would
+    not do: a shadow only takes light away, and its pull stays.
+
+    Directions move on the sphere; the angles of a cone are kept in order by logistic functions.
+    A negative color says that the model does not fit. The search finds the nearest minimum. A
+    parameter that changes nothing at the start, the position of a light that reaches nothing
+    say, stays, and the log says so.
+
+    Source: Golub & Pereyra 1973, variable projection; Schoeneman et al. 1993, colors as a
     linear problem; Beaton & Tukey 1974, the weights; Blake & Zisserman 1987, easing down; the
     windows, and the bounds of success, are our own.
     """
     gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
     check_camera("lights(camera)", camera)
-    reference, gbuffer, given = _known(_reference(reference, gbuffer), gbuffer, weights)
+    reference, gbuffer, given = _masked(_reference(reference, gbuffer), gbuffer, weights)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
     option("lights(loss=...)", loss, get_args(Loss))
@@ -187,50 +211,36 @@ def lights(
             rounds,
             start,
             lambda given: Model(gbuffer, camera, _entries(given, len(start), shape), names),
-            visibility,
+            visibilities,
             lambda model, lights: search_once(
                 model, lights, reference, given, loss == "robust", descend_on
             ),
         )
-    return _fitted(model, end, reference, given, weight, noise, throw)
-
-
-def _fitted(
-    model: Model,
-    end: End,
-    reference: Array,
-    given: Array,
-    weight: Array,
-    noise: Array,
-    throw: bool,
-) -> LightsFit:
-    """The result at the end of a search: lights, picture, errors and quality."""
-    found = end.unknowns
-    image, columns = linearized(model, found)
-    proof = evidence(model, found, columns, image, reference, given, weight, noise)
-    fitted = LightsFit(
-        found,
-        image,
-        jnp.stack(end.losses),
-        proof.errors,
-        proof.groups,
-        proof.untold,
-        weight,
-        proof.share,
-        proof.explained,
-        end.result,
-    )
-    if throw and not fitted.success:
-        raise RuntimeError(
-            f"`lights` found no lights in {len(end.losses)} steps, the mean squared residual "
-            f"going from {end.losses[0]:.3g} to {end.losses[-1]:.3g}: {fitted.doubt} "
-            "`throw=False` returns what was reached."
-        )
+    fitted = _fitted(model, end, reference, given, weight, noise)
+    if throw:
+        check_success(fitted, "lights", "lights")
     return fitted
 
 
+def _fitted(
+    model: Model, end: End, reference: Array, given: Array, weight: Array, noise: Array
+) -> LightsFit:
+    """The result at the end of a search: lights, image, errors and quality."""
+    lights = end.unknowns
+    image, columns = linearized(model, lights)
+    quality = evidence(model, lights, columns, image, reference, given, weight, noise)
+    return LightsFit(
+        lights=lights,
+        image=image,
+        losses=jnp.stack(end.losses),
+        weights=weight,
+        result=end.result,
+        **quality._asdict(),
+    )
+
+
 def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
-    """The picture, checked, in the type of the cache."""
+    """The photograph, checked, in the type of the cache."""
     reference = check_image("lights(reference)", reference)
     if reference.shape != gbuffer.color.shape:
         raise ValueError(
@@ -241,25 +251,25 @@ def _reference(reference: Any, gbuffer: Any) -> Float[Array, "height width 3"]:
     return reference.astype(gbuffer.color.dtype)
 
 
-def _known(
+def _masked(
     reference: Array, gbuffer: GBuffer, weights: Any
 ) -> tuple[Array, GBuffer, Float[Array, "height width"]]:
-    """Both black where nothing is known; and the weights, 0 there."""
-    known = (gbuffer.depth > 0) & (gbuffer.depth < jnp.inf) & (gbuffer.shader >= 0)
-    given = known.astype(reference.dtype)
+    """Reference and cache, black where the cache shows no surface; the weights, 0 there."""
+    is_shown = (gbuffer.depth > 0) & (gbuffer.depth < jnp.inf) & (gbuffer.shader >= 0)
+    given = is_shown.astype(reference.dtype)
     if weights is not None:
         weights = check_depth("lights(weights=...)", weights, gbuffer.depth.shape)
         is_weight = lambda v: (np.isfinite(v) & (v >= 0)).all() and (v > 0).any()
         check("lights(weights=...)", weights, is_weight, "finite, 0 or positive, and not all 0")
         given = given * weights.astype(given.dtype)
-    known = given > 0
-    shader = jnp.where(known, gbuffer.shader, -1)
+    counts = given > 0
+    shader = jnp.where(counts, gbuffer.shader, -1)
     gbuffer = eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
-    return jnp.where(known[..., None], reference, 0), gbuffer, given
+    return jnp.where(counts[..., None], reference, 0), gbuffer, given
 
 
 def _start(lights: Any) -> tuple[Light, ...]:
-    """The lights, checked, in JAX's default type: that is the type of the solvers' numbers."""
+    """The lights, checked, in JAX's default type, which is that of a solver's unknowns."""
     lights = check_lights("lights(lights)", lights)
     if not lights:
         raise ValueError("`lights(lights)` must be a sequence of lights, got none.")
@@ -267,6 +277,7 @@ def _start(lights: Any) -> tuple[Light, ...]:
 
 
 def _names(parameters: Collection[str], lights: tuple[Light, ...]) -> tuple[str, ...]:
+    """The parameters to fit, checked, in the order of `LIGHT_PARAMETERS`."""
     names = tuple(name for name in LIGHT_PARAMETERS if name in parameters)
     if len(names) != len(parameters) or not any(free(light, names) for light in lights):
         raise ValueError(
@@ -276,16 +287,15 @@ def _names(parameters: Collection[str], lights: tuple[Light, ...]) -> tuple[str,
     return names
 
 
-def _entries(visibility: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
-    """The entries of `visibility`, checked."""
-    name = "lights(visibility=...)"
-    given = [None] * count if visibility is None else visibility
+def _entries(visibilities: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
+    """The entries of `visibilities`, checked."""
+    name = "lights(visibilities=...)"
+    given = [None] * count if visibilities is None else visibilities
     entries = items(name, given, "a sequence of entries, or a function")
     if len(entries) != count:
         raise ValueError(
-            f"`lights(visibility=...)` must have an entry for each of {count} lights, "
+            f"`lights(visibilities=...)` must have an entry for each of {count} lights, "
             f"got {len(entries)}."
         )
-    return tuple(
-        each if each is None or callable(each) else share(name, each, shape) for each in entries
-    )
+    is_image = lambda entry: entry is not None and not callable(entry)
+    return tuple(share(name, entry, shape) if is_image(entry) else entry for entry in entries)

@@ -24,6 +24,7 @@ overlap.
 
 from jaxfx.shadow.cameras import light_cameras
 from jaxfx.shadow.edge import Candidates, candidates, edge_pcf
+from jaxfx.shadow.moving_shadow import MovingShadow
 from jaxfx.shadow.pcf import hard, pcf, prefiltered
 from jaxfx.shadow.pcss import pcss
 from jaxfx.shadow.receivers import Receivers, receivers
@@ -32,6 +33,7 @@ from jaxfx.shadow.variance import variance
 
 __all__ = [
     "Candidates",
+    "MovingShadow",
     "Receivers",
     "candidates",
     "edge_pcf",

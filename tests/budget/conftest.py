@@ -6,7 +6,7 @@ import statistics
 import numpy as np
 import pytest
 
-from jaxfx.budget import _plan
+from jaxfx.budget import _search
 
 
 class Promises(list):
@@ -34,7 +34,7 @@ def later_is_quicker(monkeypatch):
     """Each way is said to be quicker than those before: the last within the error is taken."""
     turns = itertools.count(1)
     timed = lambda call, data: (of_pictures(call(*data)), 1 / next(turns))
-    monkeypatch.setattr(_plan, "timed", timed)
+    monkeypatch.setattr(_search, "timed", timed)
 
 
 @pytest.fixture(scope="session")
@@ -52,16 +52,16 @@ def promised(is_full):
 
         def timed(call, data):
             picture = of_pictures(call(*data))
-            error = _plan.mean_square(picture - exact.setdefault(id(data), picture))
+            error = _search.mean_square(picture - exact.setdefault(id(data), picture))
             return picture, 1 / (1 + float(error))
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(_plan, "timed", timed)
+            patch.setattr(_search, "timed", timed)
             for _ in range(200 if is_full else 20):
                 data, allowed = scene(rng), 10 ** rng.uniform(*exponents)
                 chosen = plan(*data, max_error=allowed)
                 difference = of_pictures(chosen(*data)) - of_pictures(effect(*data))
-                found.append((chosen, allowed, float(_plan.mean_square(difference)) ** 0.5))
+                found.append((chosen, allowed, float(_search.mean_square(difference)) ** 0.5))
                 exact.clear()
         return found
 

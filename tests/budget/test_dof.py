@@ -85,12 +85,12 @@ def test_no_error_allowed_is_the_effect_itself():
 def test_a_plan_may_approach_the_layered_effect():
     data = scene(np.random.default_rng(5), 9.9)
     full = dof.layered(*data, max_coc=10.0)
-    plan = budget.dof(*data, max_error=0.03, target="layered")
+    plan = budget.dof(*data, max_error=0.03, effect="layered")
     error = float(np.sqrt(np.mean((plan(*data) - full) ** 2)))
     assert error == pytest.approx(float(plan.predicted_error), rel=1e-6, abs=1e-12)
     assert error <= 0.03
     assert "what hides what, by scatter" in str(plan)
-    assert budget.dof(*data, max_error=0, target="layered").recipe.name == "layered"
+    assert budget.dof(*data, max_error=0, effect="layered").recipe.name == "layered"
 
 
 def test_parts_stand_for_a_picture_by_how_much_a_blur_changes_them():
@@ -148,8 +148,8 @@ def test_a_plan_is_a_pytree_and_its_picture_has_a_gradient():
     [
         ({"max_error": -1}, r"`dof\(max_error=...\)` must be a number, 0 or positive, got -1"),
         (
-            {"max_error": 1, "target": "x"},
-            r"`dof\(target=...\)` must be one of .*'layered'",
+            {"max_error": 1, "effect": "x"},
+            r"`dof\(effect=...\)` must be one of .*'layered'",
         ),
     ],
 )

@@ -1,12 +1,12 @@
-"""How a plan is found: what parts say, and what the whole scene says."""
+"""How a plan is chosen: what parts say, and what the whole scene says."""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.budget import _plan
-from jaxfx.budget._plan import Part, Search, timed
+from jaxfx.budget import _search
+from jaxfx.budget._search import Part, Search, timed
 
 
 class Way:
@@ -25,7 +25,7 @@ class Way:
 @pytest.fixture(autouse=True)
 def clock(monkeypatch):
     """Seconds that only a `Way` lets pass."""
-    monkeypatch.setattr(_plan.time, "perf_counter", lambda: Way.now)
+    monkeypatch.setattr(_search.time, "perf_counter", lambda: Way.now)
 
 
 def search(*ways, parts=True):

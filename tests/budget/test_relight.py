@@ -19,8 +19,9 @@ from jaxfx import (
     budget,
     relight,
 )
+from jaxfx.budget._lights_by_tile import Tiled
+from jaxfx.budget._merged_lights import Merged, Place, nearest
 from jaxfx.budget._tiles import blocks
-from jaxfx.budget.relight import Merged, Tiled, _nearest, _Place
 
 
 SIZE, COUNT = (8, 16), 4
@@ -147,8 +148,8 @@ def test_spot_lights_are_near_that_shine_alike():
     )
     for away in ((-0.3, 0, 0), (0, -0.07, 0), (0, 0, -0.07)):
         lights = spot(0, 0, 0), spot(0.4, 0, 0), spot(0, 0.1, 0), spot(0, 0, 0.1), spot(*away)
-        places = {(n,): _Place.of(light, 4.0) for n, light in enumerate(lights)}
-        assert _nearest(places, ()) == ((0,), (4,))
+        places = {(n,): Place.of(light, 4.0) for n, light in enumerate(lights)}
+        assert nearest(places, ()) == ((0,), (4,))
 
 
 def test_a_negative_error_is_refused():

@@ -106,7 +106,21 @@ def test_where_nothing_is_seen_the_plan_sees_nothing(later_is_quicker):
     assert np.asarray(plan(*data)[1]).sum() == 0
 
 
-def test_a_negative_error_is_refused():
+def test_the_result_has_the_size_asked_for(later_is_quicker):
     data = scene(np.random.default_rng(0))
-    with pytest.raises(ValueError, match=r"`reproject\(max_error=...\)` must be a number"):
-        inspect.unwrap(budget.reproject)(*data, max_error=-1)
+    plan = budget.reproject(*data, height=5, width=7, max_error=0.1)
+    assert plan(*data)[0].shape == (5, 7, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_error": -1}, r"`reproject\(max_error=...\)` must be a number"),
+        ({"max_error": 1, "height": 3}, r"`reproject\(width=...\)` must be a positive integer"),
+        ({"max_error": 1, "height": 0, "width": 3}, r"`reproject\(height=...\)` must be"),
+    ],
+)
+def test_a_wrong_argument_is_refused(options, message):
+    data = scene(np.random.default_rng(0))
+    with pytest.raises(ValueError, match=message):
+        inspect.unwrap(budget.reproject)(*data, **options)

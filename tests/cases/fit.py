@@ -97,6 +97,6 @@ def lights_that_cannot_be_told_apart(loss):
         how = {"loss": loss, "throw": False}
         found = fit.lights(image, lit.cache(), lit.CAMERA, start, **how)
         successes.append(found.success)
-        finite += [np.isfinite(each["color"]).all() for each in found.uncertainty]
+        finite += [np.isfinite(each["color"]).all() for each in found.standard_errors]
     figures = {"successes": float(np.mean(successes)), "finite": float(np.mean(finite))}
     return Found(figures, np.clip(image / 3, 0, 1))

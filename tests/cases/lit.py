@@ -126,7 +126,7 @@ def misses(fitted, truth):
     Of a direction the angle in radians, over the root of 2: it has two parts.
     """
     found = {}
-    pairs = zip(fitted.lights, truth, fitted.uncertainty, strict=True)
+    pairs = zip(fitted.lights, truth, fitted.standard_errors, strict=True)
     for index, (light, true, errors) in enumerate(pairs):
         for name, error in errors.items():
             parts = np.sqrt(2) if name == "direction" else 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, fit, relight, scene
-from jaxfx.fit import _pose
+from jaxfx.fit import _pose_residual as _pose
 from tests.cases import rooms
 from tests.helpers.forms import first
 
@@ -70,8 +70,8 @@ def test_a_rendered_views_pose_is_recovered(seed):
     assert found.success and found.share > 0.3
     assert angle < 0.05 and np.linalg.norm(distance) < 1e-3 * scale
     # The error is of the size that is stated.
-    assert (np.abs(distance) < 4 * found.uncertainty[:3]).all()
-    assert np.deg2rad(angle) < 4 * np.linalg.norm(found.uncertainty[3:]) < 2e-3
+    assert (np.abs(distance) < 4 * found.standard_errors["translation"]).all()
+    assert np.deg2rad(angle) < 4 * np.linalg.norm(found.standard_errors["rotation"]) < 2e-3
     assert found.losses[-1] < 0.2 * found.losses[0]
     assert jnp.allclose(found.camera.intrinsics, start.intrinsics)
 
@@ -91,7 +91,7 @@ def test_one_hole_in_the_depth_has_no_say(hole, dtype):
     # All but the frame, and those that see the hole or stand beside; a sky is a step in depth.
     ignored = 49 if hole == np.inf else 9
     assert float(found.share) == pytest.approx((26**2 - ignored) / 32**2)
-    assert np.isfinite(found.uncertainty).all()
+    assert all(np.isfinite(errors).all() for errors in found.standard_errors.values())
     np.testing.assert_allclose(found.camera.world_from_camera, eye.world_from_camera, atol=1e-5)
 
 
@@ -121,14 +121,15 @@ def test_failure_is_said():
     with pytest.raises(RuntimeError, match=r"found no pose .*: Both see only 0 % of"):
         fit.camera(reference, image, depth, source, away, progress=False)
     lost = fit.camera(reference, image, depth, source, away, throw=False, progress=False)
-    assert lost.share == 0 and jnp.isinf(lost.uncertainty).all() and not lost.success
+    assert lost.share == 0 and not lost.success
+    assert all(jnp.isinf(errors).all() for errors in lost.standard_errors.values())
 
 
 FAULTS = {
     "camera(reference)": {"reference": np.ones((8, 8, 1))},
     "camera(image)": {"image": np.full((8, 8, 3), np.nan)},
     "camera(depth)": {"depth": np.ones((8, 9))},
-    "camera(source)": {"source": OrthographicCamera(1.0, [0.0, 0.0], np.eye(4))},
+    "camera(camera)": {"camera": OrthographicCamera(1.0, [0.0, 0.0], np.eye(4))},
     "camera(start)": {"start": OrthographicCamera(1.0, [0.0, 0.0], np.eye(4))},
     "camera(hole_threshold=...)": {"hole_threshold": 0},
     "camera(max_steps=...)": {"max_steps": 0},
@@ -141,7 +142,7 @@ FAULTS = {
 def test_bad_arguments_are_named(name, fault):
     eye = PinholeCamera.from_fov(1.0, height=8, width=8)
     given = {"reference": np.ones((8, 8, 3)), "image": np.ones((8, 8, 3))}
-    given |= {"depth": np.ones((8, 8)), "source": eye, "start": eye}
+    given |= {"depth": np.ones((8, 8)), "camera": eye, "start": eye}
     with pytest.raises(ValueError, match=re.escape(f"`{name}`")):
         inspect.unwrap(fit.camera)(**given | fault, progress=False)
 
@@ -190,7 +191,9 @@ def test_success_is_what_the_images_tell_and_errors_are_of_the_size_that_is_stat
         false_alarms += is_right and not found.success
         missed += found.success and not is_right
         if is_right:
-            within.append(np.abs(distance) < 1.96 * np.asarray(found.uncertainty[:3]))
+            within.append(
+                np.abs(distance) < 1.96 * np.asarray(found.standard_errors["translation"])
+            )
     assert missed <= 0.02 * count and false_alarms <= 0.05 * count
     assert 0.4 * count < len(within) < 0.9 * count
     assert np.mean(within, axis=0).min() >= 0.85
@@ -264,8 +267,8 @@ def test_a_light_of_forty_times_white_does_not_decide_and_other_outliers_are_adm
     reference[10:36, 50:76] = np.random.default_rng(0).uniform(size=3)  # A tenth of it.
     found = fit.camera(reference, image, depth, source, source, throw=False)
     angle, distance = apart(found.camera, true)
-    assert np.deg2rad(angle) < 3 * np.linalg.norm(found.uncertainty[3:])
-    assert np.linalg.norm(distance) < 3 * np.linalg.norm(found.uncertainty[:3])
+    assert np.deg2rad(angle) < 3 * np.linalg.norm(found.standard_errors["rotation"])
+    assert np.linalg.norm(distance) < 3 * np.linalg.norm(found.standard_errors["translation"])
 
 
 @pytest.mark.full

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.fit import _descent
+from jaxfx.fit import _jackknife, _robust
 
 
 CORNER = 1.345
@@ -13,7 +13,7 @@ CORNER = 1.345
 
 @pytest.mark.parametrize("x", [0.0, 0.5, -1.0, 1.345, -1.345, 2.0, -50.0])
 def test_half_the_square_is_hubers_loss(x):
-    value = float(_descent.huber(jnp.asarray(x)))
+    value = float(_robust.huber(jnp.asarray(x)))
     size = abs(x)
     loss = x * x / 2 if size <= CORNER else CORNER * (size - CORNER / 2)
     assert value * value / 2 == pytest.approx(loss, rel=1e-12)
@@ -23,7 +23,7 @@ def test_half_the_square_is_hubers_loss(x):
 @pytest.mark.parametrize("x", [0.0, 0.5, 1.345, 2.0, -50.0])
 def test_the_derivative_of_the_loss_is_the_clipped_residual(x):
     """At the corner too, where both pieces have the same one; in both modes."""
-    loss = lambda x: _descent.huber(x) ** 2 / 2
+    loss = lambda x: _robust.huber(x) ** 2 / 2
     slope = np.clip(x, -CORNER, CORNER)
     assert float(jax.grad(loss)(jnp.asarray(x))) == pytest.approx(slope, abs=1e-12)
     pushed = jax.jvp(loss, (jnp.asarray(x),), (jnp.ones(()),))[1]
@@ -42,7 +42,7 @@ def test_the_covariance_is_that_of_leaving_each_block_out():
     away = np.array(without) - np.mean(without, axis=0)
     expected = 8 / 9 * away.T @ away
     residual = columns @ best - aim
-    found = _descent.covariance(*map(jnp.asarray, (columns, residual, block)), 10)
+    found = _jackknife.covariance(*map(jnp.asarray, (columns, residual, block)), 10)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-12)
 
 
@@ -51,18 +51,18 @@ def test_what_nothing_tells_has_no_finite_error():
     columns, residual = rng.normal(size=(80, 3)), jnp.asarray(rng.normal(size=80))
     block = jnp.arange(80) % 8
     columns[:, 1] = 0
-    found = np.asarray(_descent.covariance(jnp.asarray(columns), residual, block, 8))
+    found = np.asarray(_jackknife.covariance(jnp.asarray(columns), residual, block, 8))
     assert np.isinf(found[1]).all() and np.isfinite(found[np.ix_([0, 2], [0, 2])]).all()
     columns[:, 1] = columns[:, 0]  # The two can't be told apart.
-    found = np.asarray(_descent.covariance(jnp.asarray(columns), residual, block, 8))
+    found = np.asarray(_jackknife.covariance(jnp.asarray(columns), residual, block, 8))
     assert found[0, 0] > 1e6 * found[2, 2] and found[1, 1] > 1e6 * found[2, 2]
-    few = _descent.covariance(jnp.asarray(columns), residual, block % 2, 2)
+    few = _jackknife.covariance(jnp.asarray(columns), residual, block % 2, 2)
     assert np.isinf(few).all()
 
 
 def test_tiles_cover_an_image_of_any_size():
     for shape in ((16, 24, 3), (9, 7, 1), (3, 5, 2)):
-        tile, count = _descent.tiles(shape)
+        tile, count = _jackknife.tiles(shape)
         plane = np.asarray(tile).reshape(shape)
         assert count == 64 and (plane == plane[..., :1]).all()
         row, column = np.divmod(plane[..., 0], 8)

@@ -97,14 +97,14 @@ def test_the_threshold_of_layered_scatter_is_found():
     draw = functools.partial(dof.layered, image, depth, max_coc=4.0)
     fitted = fit.dof(
         *(draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)),
-        method="layered",
+        effect="layered",
         threshold=2.0,
         max_coc=4.0,
         progress=False,
     )
     values = fitted.lens.aperture, fitted.lens.focus_distance, fitted.threshold
     np.testing.assert_allclose(values, (0.12, 3.0, 1.2), rtol=0.01)
-    assert set(fitted.uncertainty) == set(fit.LAYERED_PARAMETERS)
+    assert set(fitted.standard_errors) == set(fit.LAYERED_PARAMETERS)
 
 
 @pytest.mark.full
@@ -115,7 +115,7 @@ def test_a_lens_that_no_derivative_moves_may_be_held():
     how = {"parameters": ("gamma",), "max_coc": 2.0, "throw": False}
     held = fit.dof(0.9 * image, image, depth, lens, **how)
     assert held.lens.aperture == lens.aperture
-    assert held.uncertainty["gamma"] > 1e6
+    assert held.standard_errors["gamma"] > 1e6
 
 
 @pytest.mark.full
@@ -153,7 +153,7 @@ def test_what_is_frozen_stays(free):
     fitted = quietly(*picture(), start, parameters=free)
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
     assert all(found(fitted)[name] == TRUTH[name] for name in TRUTH if name not in free)
-    assert set(fitted.uncertainty) == set(free)
+    assert set(fitted.standard_errors) == set(free)
 
 
 TOLERANCE = {"rtol": 1e-6, "atol": 1e-8}
@@ -218,11 +218,11 @@ def test_what_the_picture_cannot_tell_is_uncertain():
     fitted = quietly(*behind_the_focus(), throw=False)
     assert not fitted.success and "do not tell aperture" in fitted.doubt
     assert fitted.untold == fit.PARAMETERS
-    assert fitted.uncertainty["gamma"] == fitted.uncertainty["epsilon"] == np.inf
+    assert fitted.standard_errors["gamma"] == fitted.standard_errors["epsilon"] == np.inf
     # One plane has one circle of confusion: the aperture or the focus may have made it.
-    assert fitted.uncertainty["aperture"] > TRUTH["aperture"]
+    assert fitted.standard_errors["aperture"] > TRUTH["aperture"]
     alone = quietly(*behind_the_focus(), parameters=("aperture",))
-    assert alone.uncertainty["aperture"] < 0.01 * TRUTH["aperture"]
+    assert alone.standard_errors["aperture"] < 0.01 * TRUTH["aperture"]
 
 
 @pytest.mark.full
@@ -234,7 +234,7 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
         fitted = quietly(reference + rng.normal(0, 0.01, reference.shape), image, depth)
         values = found(fitted)
         misses.append(
-            [(values[name] - TRUTH[name]) / fitted.uncertainty[name] for name in TRUTH]
+            [(values[name] - TRUTH[name]) / fitted.standard_errors[name] for name in TRUTH]
         )
     # By the median: one draw in eight makes epsilon's other minimum, at 1.4, the lower one.
     spread = np.median(np.abs(misses), axis=0) / 0.6745
@@ -277,10 +277,10 @@ FAULTS = {
     "dof(parameters=...)": {"parameters": ("aperture", "focal_pixels")},
     "dof(parameters=...) must name some": {"parameters": ()},
     "dof(parameters=...) must name some of ('aperture', 'focus_distance', 'threshold',": {
-        "method": "layered",
+        "effect": "layered",
         "parameters": ("gamma",),
     },
-    "dof(method=...)": {"method": "gather"},
+    "dof(effect=...)": {"effect": "gather"},
     "dof(threshold=...)": {"threshold": -1.0},
     "dof(max_steps=...)": {"max_steps": 0},
     "dof(loss=...)": {"loss": "huber"},
@@ -294,7 +294,12 @@ FAULTS = {
         "reference": [np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE - 1, 3))]
     },
     "dof(behind=...)[0]": {"behind": (np.zeros((4, 4)), np.ones((4, 4)))},
+    "dof(behind=...)[0] must have shape": {
+        "effect": "layered",
+        "behind": (np.zeros((SIZE, SIZE, 1)), np.ones((SIZE, SIZE))),
+    },
     "dof(max_coc=...) must be positive": {"max_coc": -1},
+    "dof(max_coc=...) must be positive and finite": {"max_coc": np.inf},
 }
 
 
@@ -404,7 +409,7 @@ def test_several_pictures_tell_one_aperture():
     foci = [float(lens.focus_distance) for lens in fitted.lenses]
     np.testing.assert_allclose(foci, (2.5, 4.0), rtol=0.02)
     np.testing.assert_allclose([lens.aperture for lens in fitted.lenses], 0.12, rtol=0.02)
-    assert fitted.uncertainty["focus_distance"].shape == (2,)
+    assert fitted.standard_errors["focus_distance"].shape == (2,)
     # One aperture for both: the second picture's error is the first's.
-    errors = fitted.uncertainty["aperture"]
+    errors = fitted.standard_errors["aperture"]
     assert float(errors[0]) == pytest.approx(float(errors[1]))

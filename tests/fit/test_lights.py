@@ -120,7 +120,7 @@ def test_what_is_frozen_stays():
     for name in ("color", "position"):
         for found, true in zip(fitted.lights, truth, strict=True):
             np.testing.assert_array_equal(getattr(found, name), getattr(true, name))
-    assert [set(each) for each in fitted.uncertainty] == [set(), {"direction", "angles"}]
+    assert [set(each) for each in fitted.standard_errors] == [set(), {"direction", "angles"}]
 
 
 @pytest.mark.full
@@ -153,7 +153,7 @@ def test_colors_alone_are_a_linear_problem():
         [relight.shade(cache(), CAMERA, *each) for each in zip(white, masks, strict=True)]
     )
     given = rng.uniform(0.2, 1, (SIZE, SIZE))
-    how = {"visibility": masks, "weights": given, "loss": "squares", "throw": False}
+    how = {"visibilities": masks, "weights": given, "loss": "squares", "throw": False}
     fitted = colors_of(reference, cache(), SUNS, **how)
     root, tile = np.sqrt(given).ravel(), np.arange(SIZE) // 4
     tile = (8 * tile[:, None] + tile).ravel()
@@ -164,7 +164,7 @@ def test_colors_alone_are_a_linear_problem():
         )[0]
         np.testing.assert_allclose([each.color[c] for each in fitted.lights], solve(-1))
         without = np.array([solve(i) for i in range(64)])
-        errors = [each["color"][c] for each in fitted.uncertainty]
+        errors = [each["color"][c] for each in fitted.standard_errors]
         np.testing.assert_allclose(errors, np.sqrt(63 * np.var(without, axis=0)), rtol=1e-6)
     np.testing.assert_array_equal(fitted.weights, given)
     assert "contrast is explained" in fitted.doubt
@@ -179,8 +179,8 @@ def test_a_light_that_reaches_nothing():
     fitted = colors_of(reference, cache(), lights, throw=False)
     assert fitted.doubt == "The picture does not tell the color of light 2."
     assert fitted.lights[2].color.tolist() == [0, 0, 0]
-    assert fitted.uncertainty[2]["color"].tolist() == [np.inf] * 3
-    assert np.isfinite(fitted.uncertainty[1]["color"]).all()
+    assert fitted.standard_errors[2]["color"].tolist() == [np.inf] * 3
+    assert np.isfinite(fitted.standard_errors[1]["color"]).all()
     assert fitted.indistinct == ()
 
 
@@ -199,7 +199,7 @@ def test_lights_that_cannot_be_told_apart(made, lights, groups):
     reference = relight.render(made(), CAMERA, lights)
     fitted = colors_of(reference, made(), lights, throw=False)
     assert fitted.indistinct == groups and fitted.success == (not groups)
-    for index, errors in enumerate(fitted.uncertainty):
+    for index, errors in enumerate(fitted.standard_errors):
         alone = all(index not in group for group in groups)
         assert np.isfinite(errors["color"]).all() == alone
     for group in groups:
@@ -238,7 +238,7 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
             [
                 (light.color - true.color) / errors["color"]
                 for light, true, errors in zip(
-                    fitted.lights, SUNS, fitted.uncertainty, strict=True
+                    fitted.lights, SUNS, fitted.standard_errors, strict=True
                 )
             ]
         )
@@ -273,7 +273,7 @@ def test_a_start_that_nothing_moves_is_said(light, caplog):
     (message,) = {record.getMessage() for record in caplog.records if record.name == "jaxfx"}
     assert "can't move" in message and f"position of light {len(SUNS)}" in message
     np.testing.assert_array_equal(fitted.lights[-1].position, light.position)
-    assert np.isinf(fitted.uncertainty[-1]["position"]).all()
+    assert np.isinf(fitted.standard_errors[-1]["position"]).all()
     with pytest.raises(ValueError, match=r"`lights\(lights\)` must start where.* position of"):
         quietly(picture(), cache(), (light,), parameters=("position",))
 
@@ -292,8 +292,11 @@ FAULTS = {
     "lights(gbuffer)": {"gbuffer": np.zeros((SIZE, SIZE))},
     "lights(lights)": {"lights": ()},
     "lights(lights[1])": {"lights": (*SUNS[:1], "sun")},
-    "lights(visibility=...) must have an entry": {"visibility": [None]},
-    "lights(visibility=...) must have shape": {"visibility": [None, None, np.ones((3, 3))]},
+    "lights(visibilities=...) must have an entry": {"visibilities": [None]},
+    "lights(visibilities=...) must have shape": {"visibilities": [None, None, np.ones((3, 3))]},
+    "lights(visibilities=...) must have shape (32, 32)": {
+        "visibilities": [None, None, lambda light: np.ones((3, 3))]
+    },
     "lights(parameters=...)": {"parameters": ("colour",)},
     "lights(parameters=...) must name some": {"parameters": ()},
     "lights(parameters=...) must": {"parameters": ("angles",)},
@@ -333,7 +336,7 @@ def test_a_sun_by_its_shadow(about):
         boxes().gbuffer,
         boxes().eye,
         (sky, sun),
-        visibility=boxes().shadows,
+        visibilities=boxes().shadows,
         rounds=len(boxes().scales),
         loss="squares",
         progress=False,

@@ -139,7 +139,7 @@ def test_how_far_a_distant_lamp_is_remains_untold():
         found = fitted_to(grainy([truth], noise=noise), [start])
         assert not found.success and (0, "position") in found.untold
         assert "position of light 0" in found.doubt
-        error = np.linalg.norm(found.uncertainty[0]["position"])
+        error = np.linalg.norm(found.standard_errors[0]["position"])
         assert error > 0.2 * np.linalg.norm(found.lights[0].position)
 
 
@@ -153,7 +153,7 @@ def test_suns_that_are_nearly_one_are_doubted(gap):
         found = fitted_to(grainy(truth, seed), start)
         assert found.indistinct == ((0, 1),) and found.explained > 0.99
         assert found.doubt == "The picture can't tell apart lights 0 and 1."
-        assert all(np.isinf(errors["color"]).all() for errors in found.uncertainty)
+        assert all(np.isinf(errors["color"]).all() for errors in found.standard_errors)
     truth = [DirectionalLight([x, 0.2, 1.0], WHITE) for x in (0.0, 0.6)]
     assert fitted_to(grainy(truth), start).success
 
@@ -165,4 +165,4 @@ def test_a_few_pixels_are_not_enough():
     weights[10:14, 10:14] = 1
     found = fitted_to(image, start, weights=weights)
     assert not found.success
-    assert all(np.isinf(v).all() for each in found.uncertainty for v in each.values())
+    assert all(np.isinf(v).all() for each in found.standard_errors for v in each.values())

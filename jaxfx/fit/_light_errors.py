@@ -1,4 +1,4 @@
-"""Standard errors of lights, and which lights and parameters a picture does not determine."""
+"""Standard errors of lights, and which lights and parameters an image does not determine."""
 
 from typing import Any, NamedTuple
 
@@ -8,33 +8,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfx.fit._descent import covariance, standard_errors, tiles
-from jaxfx.fit._lighting import Model, middle_of, with_values
+from jaxfx.fit._jackknife import covariance, independent_errors, tiles
+from jaxfx.fit._light_model import Model, mean_point, with_values
 from jaxfx.fit._robust import CUT, flatness, lengths
 from jaxfx.light import Light
 
 
-# Columns of the normal matrix, each of length 1, are taken for dependent where a combination
-# of length 1 is shorter than a thousandth; lights for one group where they share in it so much.
+# Columns of the Jacobian, each of length 1, are dependent where a combination of length 1 of
+# them has a square below the first number (is shorter than a thousandth); lights are one group
+# where the norm of their part in such combinations is above the second. With larger first or
+# smaller second numbers lights that differ are called one.
 _DEPENDENT, _SHARED = 1e-6, 1e-2
 
-# Two lights of one kind are as one where their places and directions differ by less than so
-# many of their joint standard errors: brightness may then go from one to the other, by far more
-# than derivatives tell. With a smaller number chance makes two lights of one, with a larger one
+# Two lights of one kind are as one where their positions and directions differ by fewer of
+# their joint standard errors: brightness may then go from one to the other, by far more than
+# derivatives tell. With a smaller number two lights are told apart by chance, with a larger one
 # lights that are apart are called one.
 _APART = 3.0
 
-# The noise of any picture is at least this share of its root mean square, about that of 8
-# bits: less makes no outlier, and nothing is stated to be surer than with such noise.
+# The least noise of an image, as a ratio to its root mean square, about that of 8 bits: smaller
+# differences are no outliers, and no standard error is below that of such noise.
 LEAST_NOISE = 1e-3
 
-# A standard error above this is that of what is not known: of a direction or an angle in
-# radians, of a position over its distance to what is lit, of a colour in what its light adds to
-# the picture, root mean square, over the picture's.
+# The largest standard error of a parameter that is determined: of a direction or an angle in
+# radians; of a position as a ratio to its distance from the lit points; of a color as the ratio
+# of what it adds to the image to the image itself, root mean squares.
 _MOST_ERROR = 0.2
 
-# A picture whose contrast is a smaller share of its root mean square is taken to have so much:
-# on an even wall, noise is all the contrast that there is.
+# The least contrast of an image, as a ratio to its root mean square: the contrast of an even
+# wall is noise, of which nothing can be explained.
 _LEAST_CONTRAST = 0.1
 
 Errors = tuple[dict[str, Float[Array, "..."]], ...]
@@ -42,10 +44,10 @@ Groups = tuple[tuple[int, ...], ...]
 
 
 class Evidence(NamedTuple):
-    """The fields of `LightsFit` on how well a picture determines its lights."""
+    """The fields of `LightsFit` on how well an image determines its lights."""
 
-    errors: Errors
-    groups: Groups
+    standard_errors: Errors
+    indistinct: Groups
     untold: tuple[tuple[int, str], ...]
     share: Float[Array, ""]
     explained: Float[Array, ""]
@@ -61,14 +63,15 @@ def evidence(
     weight: Float[Array, "height width"],
     noise: Float[Array, "2"],
 ) -> Evidence:
-    """From the picture at the end of a search and its derivatives, and what pixels counted.
+    """Standard errors and quality at the end of a search.
 
-    The columns are in the order of the lights and of their values. `noise` is inf where all
-    counted as given.
+    `columns` is the Jacobian of `image` there, in the order of the lights and of their values.
+    `given` are the user's weights, `weight` those at the end; `noise` is that of `_robust`, inf
+    where all pixels count as given.
     """
     exact = lambda *arrays: (array.astype(float) for array in arrays)
     columns, image, reference, noise = exact(columns, image, reference, noise)
-    given, weight, seen = exact(given, weight, _basis(model, lights))
+    given, weight, basis = exact(given, weight, _basis(model, lights))
     root = jnp.sqrt(weight)[..., None]
     columns = jnp.repeat(root, 3, axis=2).reshape(-1, 1) * columns
     length = lengths(image - reference, given)
@@ -77,39 +80,42 @@ def evidence(
     block, count = tiles(residual.shape)
     variances = jnp.diagonal(covariance(columns, residual.reshape(-1), block, count))
     least = LEAST_NOISE * brightness(reference, given)
-    floor = standard_errors(columns, jnp.full_like(residual, least))
+    floor = independent_errors(columns, jnp.full_like(residual, least))
     errors = jnp.sqrt(jnp.maximum(variances, floor**2))
-    projection = _projection(np.asarray(columns, np.float64))
+    projection = _null_projection(np.asarray(columns, np.float64))
     is_untold = np.diag(projection) > _SHARED
     errors = jnp.where(is_untold | jnp.isnan(errors), jnp.inf, errors)
-    owners = [i for i, each in enumerate(map(model.values, lights)) for _ in _flat(each)]
-    found = _by_light(model, lights, errors)
-    near = _near(lights, found)
+    owners = [i for i, values in enumerate(map(model.values, lights)) for _ in _flat(values)]
+    by_light = _by_light(model, lights, errors)
+    near = _near(lights, by_light)
     for index in {index for pair in near for index in pair}:
-        if "color" in found[index]:
-            found[index]["color"] = jnp.full(3, jnp.inf)
+        if "color" in by_light[index]:
+            by_light[index]["color"] = jnp.full(3, jnp.inf)
+    is_reached = jnp.any(basis != 0, axis=(0, 3))
     return Evidence(
-        found,
+        by_light,
         _groups([*near, *_dependent(projection, np.array(owners))]),
-        _untold(model, lights, found, seen, reference, given),
-        jnp.sum(jnp.where(jnp.any(seen != 0, axis=(0, 3)), weight, 0)) / jnp.sum(given),
+        _untold(model, lights, by_light, basis, reference, given),
+        jnp.sum(jnp.where(is_reached, weight, 0)) / jnp.sum(given),
         _explained(reference, given, jnp.minimum(length[0], CUT * noise[0])),
     )
 
 
 @eqx.filter_jit
 def linearized(model, lights):
-    """The picture, and its Jacobian in the order of the lights and of their values."""
+    """The image, and its Jacobian: residual number, by the lights and their values."""
 
     def draw(values):
-        moved = [with_values(light, each) for light, each in zip(lights, values, strict=True)]
+        moved = [with_values(light, own) for light, own in zip(lights, values, strict=True)]
         image = model(moved)
         return image, image
 
     values = [model.values(light) for light in lights]
     jacobian, image = jax.jacfwd(draw, has_aux=True)(values)
     blocks = [
-        each[name] for each, value in zip(jacobian, values, strict=True) for name in value
+        derivatives[name]
+        for derivatives, own in zip(jacobian, values, strict=True)
+        for name in own
     ]
     columns = [block.reshape(-1, block.shape[-1]) for block in blocks]
     return image, jnp.concatenate(columns, axis=1)
@@ -123,7 +129,7 @@ def _basis(model, lights):
 def brightness(
     image: Float[Array, "height width 3"], given: Float[Array, "height width"]
 ) -> Float[Array, ""]:
-    """The root mean square of a picture where it counts; 1 for black."""
+    """The root mean square of an image by weight; 1 for black."""
     root = jnp.sqrt(jnp.mean(given[..., None] * image**2) / jnp.mean(given))
     return jnp.where(root > 0, root, 1)
 
@@ -133,10 +139,10 @@ def _explained(
     given: Float[Array, "height width"],
     length: Float[Array, "height width"],
 ) -> Float[Array, ""]:
-    """The share of the contrast that residuals of these lengths leave explained."""
+    """The ratio of the reference's contrast that residuals of these lengths do not take up."""
     weight = (given / jnp.sum(given))[..., None]
-    middle = jnp.sum(weight * reference, axis=(0, 1), keepdims=True)
-    contrast = jnp.sum(weight * (reference - middle) ** 2)
+    mean = jnp.sum(weight * reference, axis=(0, 1), keepdims=True)
+    contrast = jnp.sum(weight * (reference - mean) ** 2)
     least = 3 * (_LEAST_CONTRAST * brightness(reference, given)) ** 2
     return 1 - jnp.sum(weight[..., 0] * length**2) / jnp.maximum(contrast, least)
 
@@ -149,18 +155,21 @@ def _untold(
     reference: Float[Array, "height width 3"],
     given: Float[Array, "height width"],
 ) -> tuple[tuple[int, str], ...]:
-    """The parameters, by light and name, that are not known."""
+    """The parameters that are not determined, as the index of their light and their name.
+
+    `basis` is what each light adds to the image if it is white.
+    """
     whole, names = brightness(reference, given), []
-    each: tuple[Any, ...] = lights
-    for index, (light, own, white) in enumerate(zip(each, errors, basis, strict=True)):
+    fields: tuple[Any, ...] = lights
+    for index, (light, own, white) in enumerate(zip(fields, errors, basis, strict=True)):
         lit = given * jnp.sum(white, axis=-1)
         for name, error in own.items():
             size = 1.0
             if name == "color":
                 size = whole / brightness(white, given)
             elif name == "position":
-                lit_middle = middle_of(model.gbuffer, model.camera, lit)
-                size = jnp.linalg.norm(light.position - lit_middle)
+                lit_point = mean_point(model.gbuffer, model.camera, lit)
+                size = jnp.linalg.norm(light.position - lit_point)
             if not jnp.linalg.norm(error) <= _MOST_ERROR * size:
                 names.append((index, name))
     return tuple(names)
@@ -173,18 +182,21 @@ def _flat(values: dict[str, Array]) -> list[Array]:
 def _by_light(
     model: Model, lights: tuple[Light, ...], errors: Float[Array, " number"]
 ) -> Errors:
-    """The errors by light and name; a direction's two as one angle."""
-    rest, found = list(errors), []
+    """The errors by light and name; the two of a direction as one angle."""
+    rest, by_light = list(errors), []
     for light in lights:
-        found.append({})
+        by_light.append({})
         for name, value in model.values(light).items():
             own, rest = jnp.stack(rest[: len(value)]), rest[len(value) :]
-            found[-1][name] = jnp.sqrt(jnp.sum(own**2)) if name == "direction" else own
-    return tuple(found)
+            by_light[-1][name] = jnp.sqrt(jnp.sum(own**2)) if name == "direction" else own
+    return tuple(by_light)
 
 
-def _projection(columns: Float[np.ndarray, "residual number"]) -> np.ndarray:
-    """On the combinations of columns that change nothing, of those that change something."""
+def _null_projection(columns: Float[np.ndarray, "residual number"]) -> np.ndarray:
+    """The projection, number number, onto combinations of parameters that change nothing.
+
+    Columns of zeros are left out: they are told by their errors.
+    """
     lengths = np.linalg.norm(columns, axis=0)
     is_told = lengths > 0
     columns = columns / np.where(is_told, lengths, 1)
@@ -194,28 +206,31 @@ def _projection(columns: Float[np.ndarray, "residual number"]) -> np.ndarray:
 
 
 def _dependent(projection: np.ndarray, owners: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of lights that share in combinations of columns that change nothing."""
+    """Pairs of lights that take part in one combination of parameters that changes nothing.
+
+    `owners` is the light of each number.
+    """
     lights = np.unique(owners).tolist()
     shared = lambda i, j: np.linalg.norm(projection[owners == i][:, owners == j])
     return [(i, j) for i in lights for j in lights if i < j and shared(i, j) > _SHARED]
 
 
 def _near(lights: tuple[Light, ...], errors: Errors) -> list[tuple[int, int]]:
-    """Pairs of lights of one kind that were moved and are as one within their errors."""
+    """Pairs of lights of one kind whose fitted places lie within `_APART` joint errors."""
     pairs = []
-    for i, one in enumerate(lights):
+    for i, light in enumerate(lights):
         for j, other in enumerate(lights[:i]):
             names = [name for name in ("position", "direction") if name in errors[i]]
-            if type(one) is not type(other) or not names:
+            if type(light) is not type(other) or not names:
                 continue
-            if all(_apart(one, other, name, errors[i], errors[j]) < _APART for name in names):
+            if all(_apart(light, other, name, errors[i], errors[j]) < _APART for name in names):
                 pairs.append((j, i))
     return pairs
 
 
-def _apart(one: Any, other: Any, name: str, error: Any, other_error: Any) -> float:
-    """How far apart the places or the directions of two lights are, in joint errors."""
-    values = [np.asarray(getattr(light, name), np.float64) for light in (one, other)]
+def _apart(first: Any, other: Any, name: str, error: Any, other_error: Any) -> float:
+    """The distance between the positions or directions of two lights, in joint errors."""
+    values = [np.asarray(getattr(light, name), np.float64) for light in (first, other)]
     if name == "direction":
         values = [value / np.linalg.norm(value) for value in values]
     joint = np.linalg.norm([*np.ravel(error[name]), *np.ravel(other_error[name])])

@@ -16,7 +16,7 @@ from jaxfx import (
     PinholeCamera,
     PointLight,
     SpotLight,
-    fit,
+    shadow as shadows,
 )
 from tests.helpers.forms import first
 
@@ -52,7 +52,9 @@ def shadow_map(camera, gbuffer):
 def shadow(light_camera=STRAIGHT, gbuffer=None, size=9, with_plate=True):
     gbuffer = plane() if gbuffer is None else gbuffer
     depths = shadow_map(light_camera, gbuffer) if with_plate else gbuffer.depth
-    return fit.MovingShadow(depths, light_camera, gbuffer, STRAIGHT, softness=0.3, size=size)
+    return shadows.MovingShadow(
+        depths, light_camera, gbuffer, STRAIGHT, softness=0.3, size=size
+    )
 
 
 def sun(x=0.0, y=0.0):
@@ -157,7 +159,7 @@ def test_what_is_missing_shadows_nothing_and_spoils_no_derivative(missing):
         normal = jnp.where(lost[..., None], unread, gbuffer.normal)
         depth = jnp.where(lost, empty, gbuffer.depth)
         holed = GBuffer(*images, normal, depth, gbuffer.roughness)
-        soft = fit.MovingShadow(
+        soft = shadows.MovingShadow(
             jnp.where(lost, empty, full), STRAIGHT, holed, STRAIGHT, softness=0.3
         )
         loss = lambda v, soft=soft: jnp.sum(weight * soft(DirectionalLight(v, jnp.ones(3))))
@@ -172,11 +174,11 @@ def test_what_is_missing_shadows_nothing_and_spoils_no_derivative(missing):
 def test_nothing_shown_and_nothing_known():
     gbuffer = plane()
     empty = np.full((SIZE, SIZE), np.inf)
-    nothing = fit.MovingShadow(empty, STRAIGHT, gbuffer, STRAIGHT, softness=0.3)
+    nothing = shadows.MovingShadow(empty, STRAIGHT, gbuffer, STRAIGHT, softness=0.3)
     np.testing.assert_array_equal(nothing(sun()), 1)
     images = (gbuffer.color, gbuffer.shader, *[gbuffer.color] * 3, gbuffer.normal)
     hole = GBuffer(*images, gbuffer.depth.at[24, 24].set(jnp.inf), gbuffer.roughness)
-    holed = fit.MovingShadow(
+    holed = shadows.MovingShadow(
         shadow_map(STRAIGHT, gbuffer), STRAIGHT, hole, STRAIGHT, softness=0.3
     )
     expected = np.asarray(shadow()(sun())).copy()
@@ -198,8 +200,8 @@ def test_bad_arguments_are_named(message, fault):
     given = {"shadow_map": np.ones((3, 3)), "softness": 0.1} | fault
     call, _, rest = message.partition(" ")
     with pytest.raises(ValueError, match=re.escape(f"`{call}` {rest}")):
-        inspect.unwrap(fit.MovingShadow.__init__)(
-            object.__new__(fit.MovingShadow),
+        inspect.unwrap(shadows.MovingShadow.__init__)(
+            object.__new__(shadows.MovingShadow),
             light_camera=STRAIGHT,
             gbuffer=plane(),
             camera=STRAIGHT,
@@ -219,4 +221,6 @@ def test_a_light_of_another_kind_is_refused(camera, light):
 
 def test_an_ambient_light_has_no_shadow():
     with pytest.raises(ValueError, match=r"`MovingShadow\(light\)` must be .*got AmbientLight"):
-        inspect.unwrap(fit.MovingShadow.__call__)(shadow(CENTRAL), AmbientLight(jnp.ones(3)))
+        inspect.unwrap(shadows.MovingShadow.__call__)(
+            shadow(CENTRAL), AmbientLight(jnp.ones(3))
+        )

@@ -1,73 +1,51 @@
-"""What a plan is, and how one is chosen: by trying it on the scene that it is for."""
+"""How a plan is chosen: candidates are tried on parts of a scene, a few measured on all of it.
+
+A candidate is anything that is called like the effect, has a `title`, and draws nearly the same
+image. Parts tell which candidates are worth a measurement; the error that a plan states is
+measured on the whole scene, against the effect.
+"""
 
 import functools
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx._checks import is_concrete, number
+from jaxfx.budget.plan import Plan
 
 
-# How far a way may err on parts of a scene to be measured on all of it: first the quickest that
-# may be within the error there, then, if it is not, one that has more room.
-_ROOMS = (1.25, 1.0, 0.75)
-# A way that takes so many times as long as the effect is not drawn on further parts.
+# How far a candidate may err on parts to be measured on the whole scene, in turn, as a ratio to
+# the error allowed: parts tell an error only roughly. First the quickest that may be within the
+# error; if it is not, the quickest that leaves a margin. Each entry may cost a measurement.
+_ALLOWANCES = (1.25, 1.0, 0.75)
+
+# A candidate that takes this many times as long as the effect is not drawn on further parts.
+# At 1, chance would end the trial of one that is as quick.
 _SLOW = 1.5
+
 # The programs that were called before, and so are compiled. Kept whole: the hash of a structure
 # does not tell static fields apart.
 _called: set[Any] = set()
 
 
-@final
-class Plan(eqx.Module):
-    """The cheapest way found to an effect's picture within an error. Called like the effect.
-
-    On the scene that it was made for, its error was measured against the effect itself, and so
-    holds there; on another scene it is a guess. `print` shows what was left out, and why.
-
-    - `recipe`: what is called with the data, images of height width; a pytree.
-    - `predicted_error`: a scalar, the root mean square difference to the effect at full
-      quality, in linear image units.
-    - `predicted_seconds`, `full_seconds`: scalars, of a compiled call, and of one at full
-      quality, where that was timed; NaN where it was not.
-    - `left_out`: sentences.
-    """
-
-    recipe: Any
-    predicted_error: Float[Array, ""]
-    predicted_seconds: Float[Array, ""]
-    full_seconds: Float[Array, ""]
-    left_out: tuple[str, ...] = eqx.field(static=True)
-
-    def __call__(self, *data: Any) -> Any:
-        """As the effect, whose data these are."""
-        return self.recipe(*data)
-
-    def __str__(self) -> str:
-        lines = [f"{self.recipe.title}: error {float(self.predicted_error):.3g}"]
-        seconds, full = float(self.predicted_seconds), float(self.full_seconds)
-        lines[0] += f", {1e3 * seconds:.3g} ms instead of {1e3 * full:.3g} ms"
-        return "\n".join([*lines, *(f"- {sentence}" for sentence in self.left_out)])
-
-
 class Part(NamedTuple):
-    """A part of a scene, a small scene of its own, and the share that it stands for."""
+    """A part of a scene, itself a small scene, and the share of all that it stands for."""
 
     data: Sequence[Any]
     share: float = 1.0
 
 
 class Trial(NamedTuple):
-    """A way to make the picture, and how it went part by part, until it was dropped.
+    """A candidate, what it leaves out, and how it went part by part, until it was dropped.
 
-    `squares` are the squared errors, times the parts' shares; `time` is in the effect's.
+    `squares` are the mean squared errors, times the parts' shares; `time` is a ratio to the
+    effect's.
     """
 
     call: Any
@@ -77,14 +55,16 @@ class Trial(NamedTuple):
 
     @property
     def error(self) -> float:
-        """At least this."""
+        """The root mean square error on the parts drawn: at least that of all of them."""
         return math.sqrt(sum(self.squares))
 
 
 class Search:
-    """Ways to make an effect's picture, tried on parts of a scene, a few measured on all of it.
+    """The search for the quickest candidate within an error.
 
-    The parts tell which ways are worth a measurement. The promise rests on that alone.
+    - `effect`, `data`: what is to be replaced, and the scene.
+    - `max_error`: root mean square, in linear image units.
+    - `parts`: where candidates are tried; without any, each is measured on the whole scene.
     """
 
     def __init__(
@@ -97,35 +77,35 @@ class Search:
 
     @functools.cached_property
     def whole(self) -> tuple[Part, Any, float]:
-        """All of the scene, what the effect makes of it, and its seconds."""
+        """The whole scene, the effect's image of it, and the seconds that took."""
         return Part(self.data), *timed(self.effect, self.data)
 
     def trial(self, call: Any, left_out: str) -> Trial:
-        """A way, tried on the parts up to where it is too far off or slow; or else measured."""
+        """Try a candidate on the parts, until it is too far off or too slow."""
         if not self.parts:
             return self.measure(call, left_out)
-        most = _ROOMS[0] * self.max_error
+        most = _ALLOWANCES[0] * self.max_error
         self.tried.append(_compared(call, left_out, self.parts, most))
         return self.tried[-1]
 
     def measure(self, call: Any, left_out: str) -> Trial:
-        """A way, measured on the whole scene."""
+        """Measure a candidate on the whole scene."""
         self.measured.append(_compared(call, left_out, [self.whole]))
         return self.measured[-1]
 
     def plan(self) -> Plan:
-        """The quickest way that is within the error on the whole scene, or else the effect."""
-        for room in _ROOMS:
-            might = [trial for trial in self.tried if self._is_better(trial, room)]
-            if might:
-                quickest = min(might, key=lambda trial: trial.time)
+        """The quickest candidate within the error on the whole scene, or else the effect."""
+        for allowance in _ALLOWANCES:
+            likely = [trial for trial in self.tried if self._is_better(trial, allowance)]
+            if likely:
+                quickest = min(likely, key=lambda trial: trial.time)
                 self.tried = [trial for trial in self.tried if trial is not quickest]
                 if self._is_better(self.measure(*quickest[:2])):
                     break
         full = self.whole[2]
-        kept = filter(self._is_better, self.measured)
-        itself = Trial(self.effect, "", (), 1.0)
-        best = min(kept, key=lambda trial: trial.time, default=itself)
+        within = filter(self._is_better, self.measured)
+        effect = Trial(self.effect, "", (), 1.0)
+        best = min(within, key=lambda trial: trial.time, default=effect)
         sentences = [f"{best.left_out}."] if best.left_out else []
         for trials, where in ((self.measured, ""), (self.tried, " on parts")):
             for trial in (trial for trial in trials if trial is not best):
@@ -135,12 +115,12 @@ class Search:
                 sentences.append(f"not taken: {trial.left_out}: {why}.")
         return plan(best.call, best.error, best.time * full, full, sentences)
 
-    def _is_better(self, trial: Trial, room: float = 1.0) -> bool:
-        return trial.error <= room * self.max_error and trial.time < 1
+    def _is_better(self, trial: Trial, allowance: float = 1.0) -> bool:
+        return trial.error <= allowance * self.max_error and trial.time < 1
 
 
 def check_call(name: str, max_error: Any, data: Any) -> float:
-    """`max_error` as a number; `ValueError` if it is none or the scene can't be looked at."""
+    """`max_error` as a number; `ValueError` if it is none, or if the data are traced."""
     expected = "a number, 0 or positive"
     max_error = number(f"{name}(max_error=...)", max_error, lambda x: x >= 0, expected)
     if not is_concrete(data):
@@ -152,7 +132,7 @@ def check_call(name: str, max_error: Any, data: Any) -> float:
 
 
 def timed(call: Any, data: Sequence[Any]) -> tuple[Any, float]:
-    """The picture that a call gives, and the seconds it takes once it is compiled."""
+    """The image of a call, and the seconds it takes once it is compiled."""
     leaves, structure = jax.tree.flatten((call, data))
     kinds = [(np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves]
     program = (structure, *kinds)
@@ -162,13 +142,13 @@ def timed(call: Any, data: Sequence[Any]) -> tuple[Any, float]:
     started = time.perf_counter()
     result = jax.block_until_ready(call(*data))
     seconds = time.perf_counter() - started
-    # Of a pair it is the picture, and not its coverage.
+    # Of an image and its coverage, the image.
     return result[0] if isinstance(result, tuple) else result, seconds
 
 
 @jax.jit
 def mean_square(difference: Float[Array, "..."]) -> Float[Array, ""]:
-    """Of what is finite in both pictures; what is not is the same in both."""
+    """The mean square of a difference of images; what is not finite, in both, counts 0."""
     squares = jnp.where(jnp.isfinite(difference), difference, 0).astype(float) ** 2
     return jnp.sum(squares) / max(difference.size, 1)
 
@@ -184,12 +164,15 @@ def plan(
 def _compared(
     call: Any, left_out: str, parts: Sequence[tuple[Part, Any, float]], most: float = math.inf
 ) -> Trial:
-    """A way against the effect, part by part, until it errs by more than `most` or is slow."""
-    squares, seconds, of_effect = [], 0.0, 0.0
+    """A candidate against the effect, until it errs by more than `most` or is slow.
+
+    `parts` hold the effect's image of each and its seconds.
+    """
+    squares, seconds, effect_seconds = [], 0.0, 0.0
     for part, reference, took in parts:
-        picture, own = timed(call, part.data)
-        squares.append(part.share * float(mean_square(picture - reference)))
-        seconds, of_effect = seconds + own, of_effect + took
-        if math.sqrt(sum(squares)) > most or seconds > _SLOW * of_effect:
+        image, own = timed(call, part.data)
+        squares.append(part.share * float(mean_square(image - reference)))
+        seconds, effect_seconds = seconds + own, effect_seconds + took
+        if math.sqrt(sum(squares)) > most or seconds > _SLOW * effect_seconds:
             break
-    return Trial(call, left_out, tuple(squares), seconds / of_effect)
+    return Trial(call, left_out, tuple(squares), seconds / effect_seconds)

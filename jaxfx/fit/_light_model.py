@@ -1,4 +1,8 @@
-"""The picture as a function of its lights: what `fit.lights` searches."""
+"""An image as a function of its lights, and the residual of `fit.lights`.
+
+`Model` draws the image of given lights. `Search` turns a solver's unknowns into lights.
+`Residual` solves for the colors, in which the image is linear; the rest is the solver's.
+"""
 
 import functools
 from collections.abc import Sequence
@@ -10,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfx._checks import share
 from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -18,9 +23,12 @@ from jaxfx.light import Light, SpotLight
 from jaxfx.relight import shade
 
 
-# In units of the colours' own columns: what keeps the search finite where two are the same.
+# Ridge of the normal equations of colors, in roots of the type's rounding, with columns of
+# length 1: it keeps a search finite where two lights are the same. A larger one moves colors, a
+# smaller one leaves them to rounding.
 _RIDGE = 1e-3
-# The ratios of a cone's angles that a search starts from are this far from 0 and 1.
+# The least distance from 0 and 1 of the ratios of a cone's angles where a search starts: at 0
+# and 1 the logistic functions that keep them in order have no derivative.
 _MARGIN = 1e-3
 
 Values = dict[str, Float[Array, "_"]]
@@ -34,33 +42,38 @@ def free(light: Light, names: tuple[str, ...]) -> list[str]:
 
 
 class Model(eqx.Module):
-    """The picture as a function of the lights, of which some parameters are free."""
+    """An image as a function of its lights, of which some parameters are free.
+
+    - `visibilities`: for each light None, an image, or a function of the light.
+    - `names`: the parameters that are free.
+    """
 
     gbuffer: GBuffer
     camera: _Camera
-    visibility: tuple[Any, ...]  # an entry each: None, an array, or a function
+    visibilities: tuple[Any, ...]
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, lights: Sequence[Light]) -> Float[Array, "height width 3"]:
         return functools.reduce(jnp.add, self.terms(lights))
 
     def terms(self, lights: Sequence[Light]) -> list[Float[Array, "height width 3"]]:
-        """What each light adds to the picture."""
-        seen: list[Any] = [
-            entry(light) if callable(entry) else entry
-            for light, entry in zip(lights, self.visibility, strict=True)
+        """The image of each light alone."""
+        name, shape = "lights(visibilities=...)", self.gbuffer.depth.shape
+        visibilities: list[Any] = [
+            share(name, entry(light), shape) if callable(entry) else entry
+            for light, entry in zip(lights, self.visibilities, strict=True)
         ]
         draw = functools.partial(shade, self.gbuffer, self.camera)
-        return [draw(light, visible) for light, visible in zip(lights, seen, strict=True)]
+        return [draw(*pair) for pair in zip(lights, visibilities, strict=True)]
 
     def basis(self, lights: Sequence[Light]) -> Float[Array, "light height width 3"]:
-        """What each would add if it were white."""
+        """The image of each light alone, if it were white."""
         return jnp.stack(
             self.terms([with_values(light, {"color": jnp.ones(3)}) for light in lights])
         )
 
     def values(self, light: Light) -> Values:
-        """A light's free parameters, of which the direction is a step from its own."""
+        """The free parameters of a light; its direction as a step, 0 0, from where it is."""
         values = {"direction": jnp.zeros(2)} | {
             name: getattr(light, name) for name in ("color", "position") if hasattr(light, name)
         }
@@ -70,33 +83,39 @@ class Model(eqx.Module):
 
 
 def with_values(light: Any, values: Values) -> Any:
-    """A light with some of its parameters replaced, the direction turned."""
-    given = {name: getattr(light, name) for name in vars(light)} | values
+    """A light with some of its parameters replaced, and its direction turned by a step."""
+    fields = {name: getattr(light, name) for name in vars(light)} | values
     if "direction" in values:
-        given["direction"] = _turned(light.direction, values["direction"])
+        fields["direction"] = _turned(light.direction, values["direction"])
     if "angles" in values:
-        given["inner_angle"], given["outer_angle"] = given.pop("angles")
-    return type(light)(**given)
+        fields["inner_angle"], fields["outer_angle"] = fields.pop("angles")
+    return type(light)(**fields)
 
 
 def _turned(direction: Float[Array, "3"], step: Float[Array, "2"]) -> Float[Array, "3"]:
-    """The direction a tangent step away, in radians for small ones: stereographic."""
+    """A direction after a step across it, by stereographic projection.
+
+    A small step is an angle in radians; no step is too large.
+    """
     ahead = normalize(direction)
     across = normalize(jnp.cross(ahead, jnp.eye(3)[jnp.argmin(jnp.abs(ahead))]))
-    quarter = step @ step / 4
+    quarter_square = step @ step / 4
     sideways = step[0] * across + step[1] * jnp.cross(ahead, across)
-    return ((1 - quarter) * ahead + sideways) / (1 + quarter)
+    return ((1 - quarter_square) * ahead + sideways) / (1 + quarter_square)
 
 
 class Search(eqx.Module):
-    """What the solver's unknowns stand for: steps from the lights of the start."""
+    """The solver's unknowns as lights: steps from the lights of the start.
+
+    - `scale`: the unit of a position's step, in scene units.
+    """
 
     model: Model
     start: tuple[Any, ...]
     scale: Float[Array, ""]
 
     def unknowns(self) -> list[Values]:
-        """Those of the start."""
+        """The unknowns of the start: zeros; for a cone, logits of its ratios of angles."""
         unknowns = []
         for light in self.start:
             values = self.model.values(light)
@@ -105,12 +124,12 @@ class Search(eqx.Module):
             if "angles" in values:
                 inner, outer = values["angles"]
                 ratios = jnp.stack([inner / outer, outer / jnp.pi])
-                held = jnp.clip(ratios, _MARGIN, 1 - _MARGIN)
-                unknowns[-1]["angles"] = jnp.log(held) - jnp.log1p(-held)
+                ratios = jnp.clip(ratios, _MARGIN, 1 - _MARGIN)
+                unknowns[-1]["angles"] = jnp.log(ratios) - jnp.log1p(-ratios)
         return unknowns
 
     def lights(self, unknowns: list[Values]) -> list[Light]:
-        """The lights of the start, moved; their colours as they were."""
+        """The lights of the start after these steps; their colors as they were."""
         moved = []
         for light, steps in zip(self.start, unknowns, strict=True):
             values = dict(steps)
@@ -124,9 +143,10 @@ class Search(eqx.Module):
 
 
 class Residual(eqx.Module):
-    """The picture less the reference, over the reference's root mean square, as it counts.
+    """The image less the reference, as a function of the unknowns, with the best colors.
 
-    - `root`: height width 1, the root of each pixel's weight.
+    - `unit`: the root mean square of the reference, which divides the difference.
+    - `root`: the root of each pixel's weight.
     """
 
     search: Search
@@ -148,7 +168,10 @@ class Residual(eqx.Module):
 def _ridge_colors(
     basis: Float[Array, "light height width 3"], reference: Float[Array, "height width 3"]
 ) -> Float[Array, "light 3"]:
-    """Colours close to the best ones, by the normal equations: differentiable everywhere."""
+    """Colors close to the best, by normal equations with a ridge: differentiable everywhere.
+
+    `basis` is the image of each light if it is white.
+    """
     gram = jnp.einsum("ihwc,jhwc->cij", basis, basis)
     right = jnp.einsum("ihwc,hwc->ci", basis, reference)
     squares = jnp.diagonal(gram, axis1=1, axis2=2)
@@ -164,25 +187,29 @@ def best_colors(
     reference: Float[Array, "height width 3"],
     root: Float[Array, "height width 1"],
 ) -> Float[np.ndarray, "3 light"]:
-    """The best colours, the smallest of them where several are as good."""
-    white, aim, weight = (np.asarray(each, np.float64) for each in (basis, reference, root))
-    columns, right = weight * white, weight * aim
+    """The best colors, the smallest of them where several are as good, for the end of a search.
+
+    `root` is the root of each pixel's weight.
+    """
+    weight = np.asarray(root, np.float64)
+    columns = weight * np.asarray(basis, np.float64)
+    right = weight * np.asarray(reference, np.float64)
     solve = lambda a, b: np.linalg.lstsq(a.reshape(len(a), -1).T, b.ravel(), rcond=1e-6)[0]
     return np.stack([solve(columns[..., c], right[..., c]) for c in range(3)])
 
 
 def spread(gbuffer: GBuffer, camera: _Camera) -> Float[Array, ""]:
-    """How far the visible points are from their mean, root mean square; 1 for a single one."""
+    """Root mean square distance of the visible points from their mean; 1 where it is 0."""
     points, shown = _points(gbuffer, camera)
     points = points[shown]
     spread = np.sqrt(np.var(points, axis=0).sum()) if len(points) else 0.0
     return jnp.asarray(spread if spread > 0 else 1.0, float)
 
 
-def middle_of(
+def mean_point(
     gbuffer: GBuffer, camera: _Camera, weight: Float[Array, "height width"]
 ) -> Float[np.ndarray, "3"]:
-    """The mean of the visible points by weight; of all where that is nowhere."""
+    """The mean of the visible points by weight; of all where the weight is 0 everywhere."""
     points, shown = _points(gbuffer, camera)
     counts = np.where(shown, np.asarray(weight, np.float64), 0)
     counts = counts if counts.sum() > 0 else np.ones(shown.shape)
@@ -190,7 +217,7 @@ def middle_of(
 
 
 def _points(gbuffer: GBuffer, camera: _Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The point that each pixel shows, in world space, and where it shows one."""
+    """The point that each pixel shows, in world space, and whether it shows one."""
     shown = (gbuffer.depth > 0) & jnp.isfinite(gbuffer.depth)
     height, width = shown.shape
     pixels = pixel_centers(height, width, gbuffer.depth.dtype)

@@ -1,4 +1,4 @@
-"""Shadows that move with their light: what a shadow map says about lights beside its own."""
+"""A soft shadow that follows its light: from one shadow map, for lights near the map's own."""
 
 from typing import Any, final
 
@@ -25,30 +25,45 @@ _Moving = DirectionalLight | PointLight | SpotLight
 class MovingShadow(eqx.Module):
     """The soft shadow of a light near to the one that a shadow map was made for.
 
-    Percentage-closer filtering compares receivers with texels. Here each texel is a point of an
-    occluder in the world, which a light throws onto the picture's surfaces; when the light
-    moves, its shadow moves by as much as the occluder is high. The share of a receiver's
-    surroundings that is covered is the sum of a kernel over the texels, as the light sees them
-    beside the receiver; visibility is one minus its smoothstep. A texel covers as far as it
-    lies above the receiver's tangent plane and nearer to the light, so that no plane shadows
-    itself, however wide the kernel.
-
-    Texels that no ray of the map's own light met are not known: the shadow holds about as far
-    from its light as the kernel is wide. Render the map again from there.
+    Called with a light, it gives the visibility of each pixel, with a derivative in the light's
+    direction or position: `fit.lights` finds a sun by it. The other shadows have none.
 
     **Arguments:**
 
     - `shadow_map`: rows columns, depth from the light in scene units, inf where there is
       nothing; what is 0, negative or NaN is missing, and shadows nothing.
-    - `light_camera`: what it was made with: orthographic for a directional light, a pinhole at
+    - `light_camera`: the camera of the map: orthographic for a directional light, a pinhole at
       the light's position for others.
-    - `gbuffer`, `camera`: the picture's; `normal` and `depth` are read.
+    - `gbuffer`, `camera`: the cache of the image to shadow; `normal` and `depth` are read.
     - `softness`: scene units above a surface over which an occluder begins to count.
     - `size`: static; odd, the kernel's width in texels.
 
     **Raises:** `ValueError` for a wrong shape, a softness that is not positive or an even size.
 
-    **Gradient:** of what it gives: exact with respect to the light.
+    **Gradient:** of the visibility: exact with respect to the light.
+
+    **Example:** a plane with nothing above it.
+
+    >>> import numpy as np
+    >>> from jaxfx import DirectionalLight, GBuffer, OrthographicCamera, shadow
+    >>> camera = OrthographicCamera(4.0, [4.0, 4.0], np.eye(4))
+    >>> depth, normal = np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3))
+    >>> white, shader = np.ones((8, 8, 3)), np.zeros((8, 8), int)
+    >>> gbuffer = GBuffer(white, shader, white, white, white, normal, depth, depth / 4)
+    >>> moving = shadow.MovingShadow(depth, camera, gbuffer, camera, softness=0.3, size=3)
+    >>> float(moving(DirectionalLight([0.1, 0, 1], [1, 1, 1])).min())
+    1.0
+
+    Percentage-closer filtering compares receivers with texels. Here each texel is a point of an
+    occluder in the world, which the light projects onto the surfaces of the image; when the
+    light moves, its shadow moves by as much as the occluder is high. The part of a receiver's
+    surroundings that is covered is the sum of a kernel over the texels, at their distances from
+    the receiver as the light sees them; visibility is one minus its smoothstep. A texel covers
+    as far as it lies above the receiver's tangent plane and nearer to the light, so that no
+    plane shadows itself, however wide the kernel.
+
+    Surfaces that no ray of the map's light met are not in the map: the shadow holds for lights
+    within about the width of the kernel. Farther away, render the map again.
 
     Source: our own; the filter is Reeves, Salesin & Cook 1987, the kernel a cubic B-spline.
     """
@@ -87,9 +102,9 @@ class MovingShadow(eqx.Module):
         self.light_camera, self.softness, self.size = light_camera, softness, size
 
     def __call__(self, light: _Moving) -> Float[Array, "height width"]:
-        """Visibility of a light.
+        """The visibility of a light.
 
-        **Arguments:** `light`: the one of the map, moved a little.
+        **Arguments:** `light`: the map's light, moved a little.
 
         **Returns:** height width, in [0, 1]; 1 where nothing is shown.
 
@@ -98,8 +113,8 @@ class MovingShadow(eqx.Module):
         **Gradient:** exact with respect to the light's direction, of a directional light, or
         position, of the others.
         """
-        straight = isinstance(self.light_camera, OrthographicCamera)
-        if not isinstance(light, DirectionalLight if straight else PointLight | SpotLight):
+        is_parallel = isinstance(self.light_camera, OrthographicCamera)
+        if not isinstance(light, DirectionalLight if is_parallel else PointLight | SpotLight):
             raise ValueError(
                 "`MovingShadow(light)` must be directional for an orthographic shadow map and "
                 f"a point or spot light for a pinhole's, got {type(light).__name__}."
@@ -110,19 +125,20 @@ class MovingShadow(eqx.Module):
 
 @eqx.filter_jit
 def _visibility(shadow, light):
+    """Visibility, height width: a scan over `size` x `size` texels about each receiver."""
     size, receivers = shadow.size, shadow.receivers
-    home, depth = shadow.light_camera.project(receivers)
-    first = jnp.floor(home).astype(jnp.int32) - size // 2
-    throw = lambda points: _thrown(shadow.light_camera, light, points)
-    here = throw(receivers)
+    place, depth = shadow.light_camera.project(receivers)
+    first = jnp.floor(place).astype(jnp.int32) - size // 2
+    projected = lambda points: _projected(shadow.light_camera, light, points)
+    here = projected(receivers)
 
     def add(covered, tap):
         point, known = _read(shadow, first[..., 0] + tap % size, first[..., 1] + tap // size)
         above = jnp.sum((point - receivers) * shadow.normals, axis=-1)
         nearer = depth - shadow.light_camera.project(point)[1]
         height = jnp.where(known, jnp.minimum(above, nearer), 0)
-        # The spline is 4 wide and of sum 1; stretched to `size`, of a sum larger by as much.
-        weight = jnp.prod(_spline((throw(point) - here) / (size / 4)) / (size / 4), axis=-1)
+        # The spline is 4 wide and of sum 1. Stretched to `size` its sum grows by as much.
+        weight = jnp.prod(_spline((projected(point) - here) / (size / 4)) / (size / 4), axis=-1)
         return covered + weight * _smoothstep(height / shadow.softness), None
 
     taps = jnp.arange(size**2, dtype=jnp.int32)
@@ -133,7 +149,7 @@ def _visibility(shadow, light):
 def _read(
     shadow: MovingShadow, x: Int[Array, "height width"], y: Int[Array, "height width"]
 ) -> tuple[Float[Array, "height width 3"], Bool[Array, "height width"]]:
-    """The points of texels, and whether there are any; beyond the map there are none."""
+    """The occluders at texels, and whether there are any; beyond the map there are none."""
     rows, columns = shadow.known.shape
     inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
     x, y = jnp.clip(x, 0, columns - 1), jnp.clip(y, 0, rows - 1)
@@ -143,18 +159,18 @@ def _read(
 def _points(
     camera: _Camera, depth: Float[Array, "rows columns"]
 ) -> tuple[Float[Array, "rows columns 3"], Bool[Array, "rows columns"]]:
-    """What each pixel shows, and whether it shows anything; a harmless point if not."""
+    """The point that each pixel shows, and whether it shows one; a finite point if not."""
     known = (depth > 0) & jnp.isfinite(depth)
     pixels = pixel_centers(depth.shape[0], depth.shape[1], depth.dtype)
     return camera.unproject(pixels, jnp.where(known, depth, 1)), known
 
 
-def _thrown(
+def _projected(
     camera: _Camera, light: _Moving, points: Float[Array, "height width 3"]
 ) -> Float[Array, "height width 2"]:
-    """Where points are in the shadow map as seen by a light beside the map's own.
+    """Pixels of the shadow map where a light that has moved would see points of the world.
 
-    A directional light throws them along its rays onto the map's plane.
+    A directional light projects them along its rays onto the plane of the map's camera.
     """
     pose = camera.world_from_camera
     if isinstance(light, DirectionalLight) and isinstance(camera, OrthographicCamera):
@@ -169,10 +185,11 @@ def _thrown(
 
 def _spline(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """The cubic B-spline: 4 wide, of sum 1 over the integers, twice differentiable."""
-    outer, inner = (jnp.maximum(each - jnp.abs(x), 0) ** 3 for each in (2, 1))
+    outer, inner = (jnp.maximum(half_width - jnp.abs(x), 0) ** 3 for half_width in (2, 1))
     return (outer - 4 * inner) / 6
 
 
 def _smoothstep(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """From 0 at 0 to 1 at 1, with derivatives of 0 at both."""
     x = clip01(x)
     return x * x * (3 - 2 * x)

@@ -1,0 +1,125 @@
+"""A candidate for many lights: each light only in the tiles to which it brings enough."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfx._checks import as_array
+from jaxfx.budget._light_energy import Energy, by_kind, stacked
+from jaxfx.budget._search import Search, Trial
+from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of
+from jaxfx.relight.shading import reflected, to_surface
+
+
+# A light that is needed in a larger part of the image, a ratio, is computed everywhere: a pixel
+# of a block takes about three times as long as one of the whole image.
+_EVERYWHERE = 1 / 3
+
+
+class Tiled(eqx.Module):
+    """Some lights everywhere, others in some tiles, the rest nowhere.
+
+    - `everywhere`, `shadowed`: static; the lights of all pixels, and those whose shadows are
+      read.
+    - `parts`: the pixels of the others.
+    """
+
+    everywhere: tuple[int, ...] = eqx.field(static=True)
+    shadowed: tuple[int, ...] = eqx.field(static=True)
+    parts: tuple[Blocks, ...]
+    title: ClassVar[str] = "relighting, tile by tile"
+
+    def __call__(self, gbuffer: Any, camera: Any, lights: Any, visibilities: Any = None) -> Any:
+        """The image, called like `relight.render`."""
+
+        # Outside of the program, which so does not depend on which lights these are.
+        name = "relight(visibilities)"
+        read = {n: as_array(name, visibilities[n]) for n in self.shadowed}
+        chosen = lambda members: [(lights[n], read.get(n)) for n in members]
+        parts = [(chosen(part.members), part.item, part.pixels) for part in self.parts]
+        return _tiled(gbuffer, camera, chosen(self.everywhere), parts)
+
+
+def try_tiles(search: Search, brought: Energy) -> None:
+    """Try to leave out, tile by tile, the lights that bring least."""
+    free, spent = brought.free_shadows(search.max_error)
+    shadowed = tuple(index for index in brought.shadows if index not in free)
+    is_free = np.isin(np.arange(brought.energy.shape[1]), free)
+    energy = np.where(is_free[None], brought.unshadowed, brought.energy)
+    order = np.argsort(energy, axis=1)
+    # Lights that bring amounts a, b, ... bring no more than a + b + ... together.
+    missing = np.cumsum(np.sqrt(np.take_along_axis(energy, order, axis=1)), axis=1) ** 2
+    squares = np.pad(missing, ((0, 0), (1, 0)))
+    fewest = spend(squares, search.max_error - spent, brought.size)
+    # In each tile, lights in order of what they bring: the first `fewest` are left out.
+    uses = (np.argsort(order, axis=1) >= fewest[:, None]).T
+    share = uses.mean(axis=1)
+    everywhere = np.flatnonzero(share > _EVERYWHERE)
+    parts = np.where((share > _EVERYWHERE)[:, None], False, uses)
+    if len(everywhere) == len(uses) and not free:
+        return
+    alone = np.sqrt(energy.sum(axis=0) / brought.size)
+    texts = []
+    if len(idle := np.flatnonzero(share == 0)):
+        texts.append(f"{_named('light', idle.tolist())}, {alone[idle].sum():.2g} at most")
+    if len(some := np.flatnonzero(parts.any(axis=1))):
+        outside = 1 - share[some].mean()
+        texts.append(f"{_named('light', some.tolist())} in {outside:.0%} of their tiles")
+    if free:
+        texts.append(f"{_named('shadow', sorted(free))}, {spent:.2g} at most")
+    lights = search.data[2]
+    pixels = blocks(parts[:, tile_of(search.data[0].depth.shape)], lights)
+    reads = tuple(n for n in shadowed if share[n] > 0)
+    candidate = Tiled(tuple(everywhere.tolist()), reads, pixels)
+    # If its part of the work is no less than what merged lights take, it is not measured.
+    work = float(np.minimum(share / _EVERYWHERE, 1).mean())
+    merged = [trial.time for trial in search.tried if trial.error <= search.max_error]
+    if work < min(merged, default=1):
+        search.measure(candidate, "; ".join(texts))
+    else:
+        search.tried.append(Trial(candidate, "; ".join(texts), (), work))
+
+
+def _named(kind: str, indices: Sequence[Any]) -> str:
+    """ "light 1" or "lights 1, 2"."""
+    numbers = ", ".join(str(index) for index in indices)
+    return f"{kind}{'s' if len(indices) > 1 else ''} {numbers}"
+
+
+@jax.jit
+def _tiled(gbuffer, camera, everywhere, parts):
+    """The image of lights and their shadows everywhere, and of those in blocks of pixels."""
+    surface = to_surface(gbuffer, camera)
+    image = jnp.zeros_like(surface.position)
+    again = jax.checkpoint(reflected, prevent_cse=False)
+
+    def add(image, each):
+        light, shadow = each
+        part = again(surface, light)
+        return image + (part if shadow is None else part * shadow[..., None]), None
+
+    for members in by_kind(*zip(*everywhere, strict=True)) if everywhere else []:
+        some = [everywhere[n] for n in members]
+        image, _ = jax.lax.scan(add, image, stacked(some, surface))
+
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), surface)
+    pixels = image.reshape(-1, 3)
+    for some, *of_each in parts:
+        lights, shadows = stacked(some, surface)
+
+        @jax.checkpoint
+        def block(pixels, each, lights=lights, shadows=shadows):
+            item, where = each
+            here = jax.tree.map(lambda x: x.at[where].get(mode="clip")[None], flat)
+            shown = reflected(here, jax.tree.map(lambda x: x[item], lights))[0]
+            if shadows is not None:
+                shadow = shadows[item].reshape(-1).at[where].get(mode="clip")
+                shown = shown * shadow[:, None]
+            return pixels.at[where].add(shown, mode="drop"), None
+
+        pixels, _ = jax.lax.scan(block, pixels, tuple(of_each))
+    return pixels.reshape(image.shape).astype(gbuffer.color.dtype)

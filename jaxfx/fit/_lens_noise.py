@@ -1,0 +1,138 @@
+"""The noise that `fit.dof` estimates for each pixel, and which pixels share one.
+
+Photographs show surfaces that the one image hides. What an effect draws beside an edge in depth
+is therefore wrong by more than noise. Pixels near edges get a standard deviation of their own;
+pixels that differ by many standard deviations (a lamp) are left out.
+"""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxfx.dof._spoiled import spoiled
+from jaxfx.fit._lens_model import DISPARITY, LENS, Model, Values
+from jaxfx.fit._lens_residual import Residual, evaluate
+
+
+# Second difference of the defocus between neighbouring pixels, in pixels, from which on there
+# is an edge in depth; it is 0 on a plane. A larger one misses edges between surfaces that lie
+# close, a smaller one takes curved surfaces for edges.
+_STEP = 0.25
+
+# The part of Gaussian differences that is smaller than one standard deviation, a ratio.
+_WITHIN = 0.68
+
+# The least standard deviation, as a ratio to that of the references: about a quarter of a step
+# of 8 bits. With less, rounding of an exact fit would be taken for noise.
+_LEAST_NOISE = 1e-3
+
+# A pixel that differs by more standard deviations than this is left out until the noise is
+# estimated again: the loss of a lamp would hide what a step gains. Below some 5, pixels are
+# lost that the lens shows in.
+_OUTLIER = 20.0
+
+# By how much an unknown (a logarithm) is moved to see which pixels depend on it. A smaller one
+# measures rounding in float32, a larger one is no longer linear.
+_NUDGE = 0.03
+
+# Strata of each of the two noises, by circle of confusion. Each stratum is one block of the
+# jackknife: of fewer, the variance is estimated poorly; in more, pixels of one error are taken
+# for independent.
+STRATA = 6
+
+
+def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
+    """The residual with the noise that its pixels have at these unknowns, and Huber's loss.
+
+    The noise is taken from the differences of pixels by how much each depends on the parameters
+    that are sought: the median of all would be that of even surfaces, which show no lens.
+    `has_edges`: whether pixels that the sprite of an edge in depth reaches have a noise of
+    their own.
+    """
+    difference, drawn, *_ = evaluate(residual, unknowns)
+    names = [name for name in unknowns if name in LENS + DISPARITY]
+    sensitivity = jnp.zeros_like(drawn)
+    for name in names or [name for name in unknowns if name != "footprint"]:
+        nudged = unknowns | {name: unknowns[name] + _NUDGE}
+        sensitivity = sensitivity + (evaluate(residual, nudged)[1] - drawn) ** 2
+    values = residual.model.values(unknowns)
+    scale, unit = _noise(residual.model, values, difference, sensitivity, has_edges)
+    return dataclasses.replace(residual, scale=scale, unit=unit, is_robust=True)
+
+
+@eqx.filter_jit
+def _noise(model, values, difference, sensitivity, has_edges):
+    """Standard deviations in units of radiance: per pixel, and of pixels far from edges."""
+    sensitivity = sensitivity * model.pictures.weights[None, ..., None]
+    tiny = jnp.finfo(sensitivity.dtype).tiny
+    least = _LEAST_NOISE * jnp.std(model.pictures.references) + tiny
+    deviation = functools.partial(_deviation, jnp.abs(difference), least=least)
+    size = jnp.max(jnp.abs(difference), axis=-1)
+    without_outliers = lambda scale: jnp.where(size > _OUTLIER * scale, jnp.inf, scale)
+    if not has_edges:
+        everywhere = deviation(sensitivity)
+        return without_outliers(jnp.full(size.shape, everywhere)), everywhere
+    reached = functools.partial(_near_edges, max_coc=model.max_coc)
+    is_near = jax.vmap(reached)(_defocus(model, values), model.circles(values))
+    near = is_near[..., None]
+    away = deviation(jnp.where(near, 0, sensitivity))
+    beside = deviation(jnp.where(near, sensitivity, 0))
+    # Where no pixel far from edges depends on the lens, those beside them are all there is.
+    away = jnp.where(jnp.any(~near & (sensitivity > 0)), away, beside)
+    scale = jnp.where(is_near, jnp.maximum(beside, away), away)
+    return without_outliers(scale), away
+
+
+def _defocus(model: Model, values: Values) -> Float[Array, "picture height width"]:
+    """The defocus in pixels, NaN where the depth is missing."""
+    depth, _ = model.depths(values)
+    count = model.pictures.focal_pixels.size
+    defocus = [model.lens(values, picture).defocus(depth) for picture in range(count)]
+    return jnp.where(depth > 0, jnp.stack(defocus), jnp.nan)
+
+
+def _near_edges(defocus: Array, circles: Array, max_coc: int | float) -> Array:
+    """The pixels that sprites beside an edge in depth reach, or that come from the frame.
+
+    What lies beyond the frame is in no image. A hole is no edge: its neighbours differ by NaN.
+    """
+    edge = jnp.ones(defocus.shape, bool).at[1:-1, 1:-1].set(False)
+    # The defocus of a plane is linear in the pixel's place, so that a slope is no edge.
+    for axis in (0, 1):
+        bend = jnp.abs(jnp.diff(defocus, n=2, axis=axis)) > _STEP
+        edge = edge | jnp.pad(bend, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
+    return spoiled(edge, circles + 2, max_coc + 2)
+
+
+def _deviation(size: Array, weight: Array, least: Array) -> Array:
+    """A standard deviation: the size below which `_WITHIN` of the weight lies."""
+    order = jnp.argsort(size.reshape(-1))
+    total = jnp.cumsum(weight.reshape(-1)[order])
+    at = jnp.searchsorted(total, _WITHIN * total[-1])
+    return jnp.maximum(size.reshape(-1)[order][jnp.minimum(at, size.size - 1)], least)
+
+
+@functools.partial(jax.jit, static_argnames=("channels", "bins"))
+def strata(
+    circles: Float[Array, "picture height width"],
+    scale: Float[Array, "picture height width"],
+    channels: int,
+    bins: int = STRATA,
+) -> Int[Array, " residual"]:
+    """The stratum of each residual, out of `2 * bins`: like noise, like circle of confusion.
+
+    What an effect draws wrong depends on the circle of confusion and on edges, not on the
+    pixel: all pixels of a stratum may err together. Strata of one noise have one size.
+    """
+    is_noisy = (scale > jnp.min(scale)).reshape(-1)
+    circles = circles.reshape(-1)
+    place = jnp.argsort(jnp.argsort(circles + jnp.where(is_noisy, 2 * jnp.max(circles), 0)))
+    quiet = jnp.sum(~is_noisy)
+    rank = jnp.where(is_noisy, place - quiet, place)
+    size = jnp.maximum(jnp.where(is_noisy, is_noisy.size - quiet, quiet), 1)
+    stratum = jnp.minimum(rank * bins // size, bins - 1) + jnp.where(is_noisy, bins, 0)
+    return jnp.repeat(stratum, channels)

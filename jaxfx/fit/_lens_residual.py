@@ -1,0 +1,108 @@
+"""The residual of `fit.dof`: what the model draws, less the photographs, after exposure."""
+
+import functools
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxfx.fit._exposure import exposure_between
+from jaxfx.fit._lens_model import Model, Values
+from jaxfx.fit._robust import huber
+
+
+Tone = Literal["linear", "log"]
+
+
+class Residual(eqx.Module):
+    """The images drawn less the references, weighted, as a function of the unknowns.
+
+    - `scale`: standard deviation of each pixel's difference, in units of radiance; inf for a
+      pixel that is left out, 1 everywhere for plain squares.
+    - `unit`: the standard deviation of pixels far from edges, in units of radiance.
+    - `is_robust`: whether the loss is Huber's, or plain squares.
+    - `exposure`: whether gain and offset are free.
+    """
+
+    model: Model
+    scale: Float[Array, "picture height width"]
+    unit: Float[Array, ""]
+    is_robust: bool = eqx.field(static=True)
+    exposure: bool = eqx.field(static=True)
+    tone: Tone = eqx.field(static=True)
+
+    def compare(self, unknowns: Values) -> tuple[Array, Array, Array, Array]:
+        """The difference per pixel after tone, the images drawn, and their gain and offset."""
+        pictures = self.model.pictures
+        drawn = self.model(self.model.values(unknowns))
+        counts = pictures.weights[None] / (self.scale / self.unit) ** 2
+
+        def exposed(drawn, reference, counts, scale):
+            return exposure_between(drawn, reference, counts, scale[..., None], self.exposure)
+
+        gain, offset = jax.vmap(exposed)(drawn, pictures.references, counts, self.scale)
+        shown = gain * drawn + offset
+        tone = functools.partial(_log_tone, white=jnp.mean(jnp.abs(pictures.references)))
+        toned = tone if self.tone == "log" else lambda x: x
+        difference = toned(shown) - toned(pictures.references)
+        return difference, drawn, gain[:, 0, 0], offset[:, 0, 0]
+
+    def weighted(self, difference: Array) -> Float[Array, "picture height width channel"]:
+        """Differences per pixel as residuals: their squares are the loss.
+
+        They are in units of radiance, those of pixels far from edges at their own size.
+        """
+        root = jnp.sqrt(self.model.pictures.weights)[None, ..., None]
+        if not self.is_robust:
+            return (root * difference).astype(float)
+        deviations = (difference / self.scale[..., None]).astype(float)
+        return self.unit.astype(float) * root.astype(float) * huber(deviations)
+
+    def __call__(self, unknowns: Values) -> Float[Array, "picture height width channel"]:
+        return self.weighted(self.compare(unknowns)[0])
+
+
+def _log_tone(x: Array, white: Array) -> Array:
+    """An odd logarithm: `x` itself where `x` is much smaller than `white`."""
+    white = jnp.maximum(white, jnp.finfo(x.dtype).tiny)
+    return white * jnp.sign(x) * jnp.log1p(jnp.abs(x) / white)
+
+
+def plain(model: Model, exposure: bool, tone: Tone) -> Residual:
+    """The residual of plain squares."""
+    one = jnp.ones(model.pictures.references.shape[:3], model.pictures.image.dtype)
+    return Residual(model, one, one[0, 0, 0], False, exposure, tone)
+
+
+@eqx.filter_jit
+def evaluate(residual: Residual, unknowns: Values) -> tuple[Array, Array, Array, Array]:
+    """`residual.compare`, compiled: all that needs no derivative shares this program."""
+    return residual.compare(unknowns)
+
+
+def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " picture"]:
+    """The mean absolute difference of each picture, in units of radiance.
+
+    It ranks lenses before any noise is estimated: unlike a mean square, it is not decided by a
+    few large differences.
+    """
+    difference = evaluate(residual, unknowns)[0]
+    weights = residual.model.pictures.weights[None, ..., None]
+    return jnp.mean(jnp.abs(difference) * weights, axis=(1, 2, 3))
+
+
+@eqx.filter_jit
+def report(residual: Residual, unknowns: Values) -> tuple[Array, Array, Array, Array, Array]:
+    """The Jacobian in the order of `ravel_pytree`, the residual, and the rest of `compare`."""
+    flat, tree = ravel_pytree(unknowns)
+
+    def both(flat):
+        difference, *rest = residual.compare(tree(flat))
+        weighted = residual.weighted(difference)
+        return weighted, (weighted, *rest)
+
+    columns, (weighted, *rest) = jax.jacfwd(both, has_aux=True)(flat)
+    return columns.reshape(-1, flat.size), weighted, *rest

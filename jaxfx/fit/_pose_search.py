@@ -1,0 +1,138 @@
+"""The search of `fit.camera`, from small blurred images to the given ones."""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfx.fit._descent import End
+from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps, report
+from jaxfx.fit._reduction import reduced, shrunk, thinned
+
+
+# The sigma of the widest blur, as a ratio to the smaller side of the image; that of the last is
+# a pixel. A wider one blurs a scene to its mean, a narrower one needs a nearer start.
+_WIDEST = 1 / 16
+
+# The largest side of the images of all but the last steps, in pixels: their time grows with its
+# square.
+_COARSE = 160
+
+# Pixels of the reference in the last steps, about; more make them slower and the pose surer.
+_PIXELS = 160 * 120
+
+# When the search at one blur ends, before that at the next; and the last one. See `descend`.
+_SOON = {"patience": 2, "gain": 1e-2}
+_LAST = {"gain": 1e-4}
+
+# The standard deviation of Gaussian noise over the median of its absolute values.
+_DEVIATION_OF_MEDIAN = 1.4826
+
+# The least standard deviations of noise: of color, as a ratio to the root mean square contrast
+# and in units of radiance; of relative depth, a ratio. Without them an exact reprojection would
+# be divided by 0.
+_LEAST_COLOR, _LEAST_RADIANCE, _LEAST_DEPTH = 1e-3, 1e-9, 1e-4
+
+
+def search(
+    views: Views, threshold: float, exposure: bool, descend_on: Callable[..., End]
+) -> tuple[Residual, End]:
+    """The pose, searched from one blur to the next on small images, then on the given ones.
+
+    Returns the residual of the last search and where that ended, with the losses of all.
+    """
+    is_known = jnp.isfinite(views.depth) & (views.depth > 0)
+    median_depth = jnp.nanmedian(jnp.where(is_known, views.depth, jnp.nan)).astype(float)
+    unit = jnp.concatenate([jnp.full(3, median_depth), jnp.ones(3, float)])
+
+    def model(views: Views, sigma: float, twist: Array, stride: int = 1) -> Residual:
+        """The residual of images blurred by `sigma`, with the scale of noise at the twist.
+
+        `sigma` is in pixels of the coarser of both images; the finer one is blurred alike in
+        the scene.
+        """
+        finer = float(views.source.intrinsics[0, 0] / views.start.intrinsics[0, 0])
+        soft = views._replace(
+            reference=blurred(views.reference, jnp.asarray(sigma * max(1 / finer, 1))),
+            image=blurred(views.image, jnp.asarray(sigma * max(finer, 1))),
+        )
+        clear = clear_of_steps(views.depth, threshold)
+        first = Residual(soft, clear, unit, jnp.ones(2, float), threshold, exposure, stride)
+        return eqx.tree_at(lambda m: m.scale, first, _scale(report(first, twist)[2]))
+
+    small = _small(views)
+    twist, losses = jnp.zeros(6, float), []
+    sharpest, *coarse = reversed(_sigmas(min(small.reference.shape[:2])))
+    for sigma in reversed(coarse):
+        end = descend_on(model(small, sigma, twist), twist, **_SOON)
+        twist, losses = end.unknowns, losses + end.losses
+    last = model(small, sharpest, twist)
+    if small is not views:
+        end = descend_on(last, twist, **_SOON)
+        twist, losses = end.unknowns, losses + end.losses
+        pixels = math.prod(views.reference.shape[:2])
+        last = model(views, sharpest, twist, math.ceil(math.sqrt(pixels / _PIXELS)))
+    end = descend_on(last, twist, **_LAST)
+    return last, end._replace(losses=losses + end.losses)
+
+
+def _sigmas(side: int) -> list[float]:
+    """The sigmas of the blurs in pixels, from coarse to fine, for images of this side."""
+    halvings = int(math.log2(max(1, _WIDEST * side)))
+    return [2.0**level for level in range(halvings, -1, -1)]
+
+
+def _small(views: Views) -> Views:
+    """The views with images of at most `_COARSE` pixels a side, and the cameras of those."""
+    reference_factor, source_factor = (
+        math.ceil(max(size) / _COARSE)
+        for size in (views.reference.shape[:2], views.depth.shape)
+    )
+    if reference_factor == source_factor == 1:
+        return views
+    own_depth = views.reference_depth
+    return Views(
+        reduced(views.reference, reference_factor),
+        None if own_depth is None else thinned(own_depth, reference_factor),
+        reduced(views.image, source_factor),
+        thinned(views.depth, source_factor),
+        shrunk(views.source, source_factor),
+        shrunk(views.start, reference_factor),
+    )
+
+
+def _scale(compared: Comparison) -> Float[Array, "2"]:
+    """Standard deviations of noise in color and, where the reference has one, in depth.
+
+    From the median of the absolute differences, which outliers do not move.
+    """
+    channels = compared.gain.size
+    is_compared = compared.counts[..., None] > 0
+    sizes = jnp.where(is_compared, jnp.abs(compared.deviations), jnp.nan)
+    color, depth = sizes[..., :channels], sizes[..., channels:]
+    least = _LEAST_COLOR * jnp.sqrt(compared.contrast.astype(float)) + _LEAST_RADIANCE
+    color = jnp.nan_to_num(_DEVIATION_OF_MEDIAN * jnp.nanmedian(color))
+    color = jnp.maximum(color, least)
+    if depth.size == 0:
+        return jnp.stack([color, jnp.ones_like(color)])
+    depth = _DEVIATION_OF_MEDIAN * jnp.nanmedian(jnp.where(depth > 0, depth, jnp.nan))
+    return jnp.stack([color, jnp.maximum(jnp.nan_to_num(depth, nan=1.0), _LEAST_DEPTH)])
+
+
+@jax.jit
+def blurred(image: Array, sigma: Array) -> Float[Array, "height width channel"]:
+    """An image blurred by a Gaussian, normalised inside the frame.
+
+    As a product of matrices: `sigma`, in pixels, is traced, so that all blurs share a program.
+    """
+
+    def weights(size: int) -> Float[Array, "size size"]:
+        place = jnp.arange(size, dtype=image.dtype) / sigma.astype(image.dtype)
+        weight = jnp.exp(-0.5 * (place[:, None] - place[None]) ** 2)
+        return weight / jnp.sum(weight, axis=1, keepdims=True)
+
+    down, across = map(weights, image.shape[:2])
+    return jnp.einsum("ij,jkc,lk->ilc", down, image, across)
