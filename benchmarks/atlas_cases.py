@@ -151,10 +151,10 @@ def depth_of_field(at: Point) -> Case:
         lambda image, depth, lens, _: method(image, depth, lens, max_coc=coc, **how)
     )
     taps = at.side**2 * (at.own + 1) ** 2
-    kernels = ("shift", "tiles", "spans", *(["segment_sum"] if taps < 2**24 else []))
+    programs = ("shift", "tiles", "spans", *(["segment_sum"] if taps < 2**24 else []))
     methods = {
         "scatter": {"auto": of(dof.scatter), "gamma 1": of(dof.scatter, gamma=1.0)},
-        **{f"scatter, {name}": {"": of(dof.scatter, kernel=name)} for name in kernels},
+        **{f"scatter, {name}": {"": of(dof.scatter, program=name)} for name in programs},
         "layered": {
             "1 layer": of(dof.layered),
             "2 layers": lambda image, depth, lens, behind: dof.layered(

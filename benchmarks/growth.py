@@ -37,7 +37,7 @@ def seconds(method, side, radius):
     if method == "native":
         call = lambda: native.scatter(image, depth, lens, 2.0, 2.0)
     else:
-        options = {"gamma": 2.0, "epsilon": 2.0, "max_coc": 2.0 * radius, "kernel": method}
+        options = {"gamma": 2.0, "epsilon": 2.0, "max_coc": 2.0 * radius, "program": method}
         scatter = jax.jit(lambda *x: dof.scatter(*x, **options))
         arguments = jnp.asarray(image), jnp.asarray(depth), lens
         call = lambda: jax.block_until_ready(scatter(*arguments))

@@ -26,11 +26,11 @@ def run(benchmark, function):
     benchmark.pedantic(function, rounds=9, warmup_rounds=1)
 
 
-def program(kernel, radius, scene):
+def program(name, radius, scene):
     image, depth, lens = scene
     scatter = jax.jit(
         lambda image, lens: dof.scatter(
-            image, depth, lens, max_coc=2.0 * radius, kernel=kernel, **OPTIONS
+            image, depth, lens, max_coc=2.0 * radius, program=name, **OPTIONS
         )
     )
     return scatter, jnp.asarray(image), lens
@@ -88,14 +88,14 @@ def test_derivatives(benchmark, method, radius, mode):
 
 
 @pytest.mark.parametrize("how", ["batch", "one by one"])
-@pytest.mark.parametrize(("kernel", "radius"), [("tiles", 8), ("spans", 32)])
-def test_batch(benchmark, kernel, radius, how):
+@pytest.mark.parametrize(("name", "radius"), [("tiles", 8), ("spans", 32)])
+def test_batch(benchmark, name, radius, how):
     """Four pictures, of which one is blurred more than all others together."""
-    benchmark.group = f"four pictures, {kernel}, radius {radius}"
+    benchmark.group = f"four pictures, {name}, radius {radius}"
     image, depth, lens = discs.two_discs(512, radius)
     images, depths = jnp.stack([jnp.asarray(image)] * 4), jnp.stack([jnp.asarray(depth)] * 4)
     lenses = [ThinLens(aperture, 2.0, lens.focal_pixels) for aperture in (1.0, 0.2, 0.1, 0.0)]
-    scatter = lambda *x: dof.scatter(*x, max_coc=2.0 * radius, kernel=kernel, **OPTIONS)
+    scatter = lambda *x: dof.scatter(*x, max_coc=2.0 * radius, program=name, **OPTIONS)
     if how == "batch":
         together = jax.tree.map(lambda *x: jnp.stack(x), *lenses)
         run(benchmark, waited(jax.jit(jax.vmap(scatter)), images, depths, together))

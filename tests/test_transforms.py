@@ -192,7 +192,7 @@ EXAMPLES = {
 # Choices that do not go together, which the function refuses by name.
 REFUSED = {
     "dof.scatter": lambda chosen: (
-        chosen["coverage"] == "indicator" and chosen["kernel"] != "segment_sum"
+        chosen["coverage"] == "indicator" and chosen["program"] != "segment_sum"
     ),
     "shadow.edge_pcf": lambda chosen: (
         chosen["dilation"] is not EXAMPLES["dilation"][chosen["edges"] == "screen"]

@@ -40,8 +40,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "scatter, gamma 50": {"gamma": 50.0},
     "scatter, epsilon 0": {"epsilon": 0.0},
     "scatter, epsilon 40": {"epsilon": 40.0},
-    "scatter, spans": {"kernel": "spans"},
-    "scatter, indicator": {"kernel": "segment_sum", "coverage": "indicator"},
+    "scatter, spans": {"program": "spans"},
+    "scatter, indicator": {"program": "segment_sum", "coverage": "indicator"},
     "depth_sorted, all": {"slices": "all"},
 }
 

@@ -18,7 +18,7 @@ from jaxfx.lens import Lens
 
 # The epsilon of `dof.scatter` that this stands for, in pixels: its default.
 EPSILON = 2.0
-_KERNELS = {"shift": shift, "tiles": tiles, "spans": spans}
+_PROGRAMS = {"shift": shift, "tiles": tiles, "spans": spans}
 _Values = Float[Array, "height width value"]
 
 
@@ -83,10 +83,10 @@ def _without(sprites: Sprites, some: Array) -> Sprites:
 
 
 def _painted(sprites: Sprites, max_coc: float) -> _Values:
-    """The sums of sprites no wider than `max_coc` pixels, by scatter's quickest kernel."""
+    """The sums of sprites no wider than `max_coc` pixels, by scatter's quickest program."""
     height, width = sprites.radius.shape
-    kernel = cheapest(height, width, max_coc)
-    return _KERNELS[kernel](sprites, reach(max_coc))
+    program = cheapest(height, width, max_coc)
+    return _PROGRAMS[program](sprites, reach(max_coc))
 
 
 def _pooled(planes: _Values) -> Float[Array, "rows columns value"]:

@@ -57,8 +57,8 @@ _METHODS = {
     "implicit diffusion": implicit_diffusion,
     "gather": gather,
 }
-# The other kernel of scatter that is tried beside the one it would take.
-_KERNELS = {"tiles": "spans", "spans": "tiles"}
+# The other program of scatter that is tried beside the one it would take.
+_PROGRAMS = {"tiles": "spans", "spans": "tiles"}
 # The methods that are tried with their defaults.
 _OTHERS = ("separable", "implicit diffusion", "blend")
 
@@ -102,7 +102,7 @@ def dof(
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_error`: root mean square, linear image units, over all pixels and channels.
     - `effect`: the effect to replace: `dof.scatter` with `gamma=0`, `epsilon=2` and exact
-      kernels, or `dof.layered`, from one layer.
+      programs, or `dof.layered`, from one layer.
 
     **Returns:** a `Plan`, to be called with `image, depth, lens`, of this scene or of others
     with no larger circles: those are drawn as large as this scene's largest.
@@ -125,7 +125,7 @@ def dof(
     stand for as many groups of tiles that a blur changes alike, or on all of it where it is
     small. The candidates: the image as it is; circles no larger than a power of two (the
     smallest that will do is searched by halving); sprites wider than 8 or 10 pixels in octaves,
-    the larger at the lower resolution; scatter's other kernel; the separable filter, diffusion,
+    the larger at the lower resolution; scatter's other program; the separable filter, diffusion,
     blending, layers; and gather, with the number of taps that its variance asks for: from the
     errors of two numbers of taps follow the part that more taps can lower and the part that
     they can't. A candidate is dropped at the tile at which it errs too much or is too slow. Of
@@ -172,10 +172,10 @@ class _Candidates(NamedTuple):
     largest: float
 
     def drawn(self, max_coc: float) -> Method:
-        """The effect, with no circle larger than `max_coc`; by the whole image's kernel."""
+        """The effect, with no circle larger than `max_coc`; by the whole image's program."""
         if self.effect == "layered":
             return Method("layered", max_coc=max_coc)
-        return Method("scatter", max_coc=max_coc, kernel=cheapest(*self.shape, max_coc))
+        return Method("scatter", max_coc=max_coc, program=cheapest(*self.shape, max_coc))
 
 
 def _parts(image: Any, depth: Any, lens: Any, largest: float) -> list[Part]:
@@ -222,7 +222,7 @@ def _smaller_circles(search: Search, shared: _Candidates) -> None:
 
 
 def _other_methods(search: Search, shared: _Candidates) -> None:
-    """Try octaves, other methods and the other kernel."""
+    """Try octaves, other methods and the other program."""
     largest = shared.largest
     for split in _SPLITS:
         if split < largest:
@@ -233,15 +233,15 @@ def _other_methods(search: Search, shared: _Candidates) -> None:
                 break
     for name in _OTHERS:
         search.trial(Method(name, max_coc=largest), f"exact discs, by {name}")
-    kernel = cheapest(*shared.shape, largest)
+    program = cheapest(*shared.shape, largest)
     if shared.effect == "layered":
-        exact = Method("scatter", max_coc=largest, kernel=kernel)
+        exact = Method("scatter", max_coc=largest, program=program)
         search.trial(exact, "what hides what, by scatter")
         return
     search.trial(Method("layered", max_coc=largest), "the sums of all discs, by layered")
-    if kernel in _KERNELS:
-        other = Method("scatter", max_coc=largest, kernel=_KERNELS[kernel])
-        search.trial(other, f'the kernel "{kernel}", by "{_KERNELS[kernel]}"')
+    if program in _PROGRAMS:
+        other = Method("scatter", max_coc=largest, program=_PROGRAMS[program])
+        search.trial(other, f'the program "{program}", by "{_PROGRAMS[program]}"')
 
 
 def _gathered(search: Search, largest: float) -> None:

@@ -29,7 +29,7 @@ def gather(
     *,
     max_coc: Number | None = None,
     taps: WholeNumber | None = None,
-    softness: Float[ArrayLike, ""] | float = 1.0,
+    ramp: Float[ArrayLike, ""] | float = 1.0,
 ) -> Float[Array, "height width channel"]:
     """Depth of field by taps on the pixel's own circle of confusion, with a test of leaks.
 
@@ -53,7 +53,7 @@ def gather(
     - `max_coc`: static; the largest diameter, in pixels, to which larger ones are clamped, and
       that of a pixel whose b is 1. Outside `jit`, `grad` and `vmap` it may be left out.
     - `taps`: how many, on a Vogel spiral; None for the paper's eight Poisson points.
-    - `softness`: pixels of defocus over which a tap turns from behind into in front. 0 is the
+    - `ramp`: pixels of defocus over which a tap turns from behind into in front. 0 is the
       paper's own step, `D_tap >= D_q`.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
@@ -61,40 +61,40 @@ def gather(
     depth is missing is read by no other, and keeps its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
-    `softness`, a bad `taps`, or no `max_coc` under a transform.
+    `ramp`, a bad `taps`, or no `max_coc` under a transform.
 
-    **Gradient:** exact with respect to `image`, `depth`, `softness` and every field of `lens`;
+    **Gradient:** exact with respect to `image`, `depth`, `ramp` and every field of `lens`;
     zero where a circle is clamped. On the focus plane, where taps leave the pixel's centre, the
-    slopes between pixels are those to the right and below. With a `softness` of 0 the
+    slopes between pixels are those to the right and below. With a `ramp` of 0 the
     derivative of the leak test is missing.
 
     Source: Scheuermann 2004, advanced depth of field: the low-resolution picture, the taps, the
     scales and the leak test. Reconstructed: what bounds a picture whose sides are no multiples
-    of 4 (its last row and column are repeated). Our own: the Vogel spiral, `softness`, and that
+    of 4 (its last row and column are repeated). Our own: the Vogel spiral, `ramp`, and that
     the leak test reads the tap at full resolution, so that the centre always counts.
     """
     image, depth, lens, max_coc = check_arguments("gather", image, depth, lens, max_coc)
-    softness = parameter("gather(softness=...)", softness)
-    check("gather(softness=...)", softness, lambda v: v >= 0, "0 or positive")
+    ramp = parameter("gather(ramp=...)", ramp)
+    check("gather(ramp=...)", ramp, lambda v: v >= 0, "0 or positive")
     disc = POISSON if taps is None else vogel(whole_number("gather(taps=...)", taps))
     disc = tuple(map(tuple, np.asarray(disc).tolist()))
-    return _gather(image, depth, lens, softness, max_coc, disc)
+    return _gather(image, depth, lens, ramp, max_coc, disc)
 
 
 @ft.partial(jax.jit, static_argnames=("max_coc", "disc"))
-def _gather(image, depth, lens, softness, max_coc, disc):
-    return _picture(image, depth, lens, softness, max_coc, disc)
+def _gather(image, depth, lens, ramp, max_coc, disc):
+    return _picture(image, depth, lens, ramp, max_coc, disc)
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
-def _picture(image, depth, lens, softness, max_coc, disc):
+def _picture(image, depth, lens, ramp, max_coc, disc):
     """An accelerator takes as long to count as to add a tap: there, two of them at a time.
 
     The derivatives would hold more than 40 pictures in memory, if they did so.
     """
     single = ft.partial(_drawn, max_coc=max_coc, disc=disc)
     pairs = ft.partial(single, at_once=2)
-    return by_platform(image, depth, lens, softness, cpu=single, accelerator=pairs)
+    return by_platform(image, depth, lens, ramp, cpu=single, accelerator=pairs)
 
 
 @_picture.defjvp
@@ -102,10 +102,10 @@ def _picture_jvp(max_coc, disc, primals, tangents):
     return jax.jvp(ft.partial(_drawn, max_coc=max_coc, disc=disc), primals, tangents)
 
 
-def _drawn(image, depth, lens, softness, max_coc, disc, at_once=1):
+def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
     dtype = image.dtype
     view = defocused(image, depth, lens, max_coc)
-    softness = softness.astype(view.image.dtype)
+    ramp = ramp.astype(view.image.dtype)
     # What is bad is told by its colour, also in the low-resolution picture.
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
     # One read gives a tap's colour, its defocus and how much of it has a depth.
@@ -130,8 +130,8 @@ def _drawn(image, depth, lens, softness, max_coc, disc, at_once=1):
         share = jnp.where(soft[..., -1] > 0, blur, 0)
         tap = mix(tap, _mean(soft), share[..., None])
         behind = (defocus >= centre - rounding).astype(image.dtype)
-        ahead = (centre - defocus) / jnp.where(softness > 0, softness, 1)
-        behind = jnp.where(softness > 0, clip01(1 - ahead), behind)
+        ahead = (centre - defocus) / jnp.where(ramp > 0, ramp, 1)
+        behind = jnp.where(ramp > 0, clip01(1 - ahead), behind)
         weight = (known * (behind + (1 - behind) * blur))[..., None]
         return (sums[0] + weight * tap, sums[1] + weight), None
 

@@ -23,7 +23,7 @@ from jaxfx.dof._tiles import SHIFTS, TILES, farthest, plain
 from jaxfx.lens import Lens
 
 
-Kernel = Literal["auto", "segment_sum", "shift", "tiles", "spans", "rows"]
+Program = Literal["auto", "segment_sum", "shift", "tiles", "spans", "rows"]
 Coverage = Literal["area", "indicator"]
 
 _PROGRAMS = {"shift": SHIFTS, "tiles": TILES, "spans": SPANS, "rows": ROWS}
@@ -50,7 +50,7 @@ def scatter(
     gamma: Float[ArrayLike, ""] | float = 0.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
     max_coc: Number | None = None,
-    kernel: Kernel = "auto",
+    program: Program = "auto",
     coverage: Coverage = "area",
 ) -> Float[Array, "height width channel"]:
     """Depth of field by point sprites: every pixel is spread over its circle of confusion.
@@ -74,7 +74,7 @@ def scatter(
     - `epsilon`: pixels; circles of confusion below it count as in focus.
     - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
-    - `kernel`: which program computes the sums, all the same: `"segment_sum"` writes every tap
+    - `program`: which program computes the sums, all the same: `"segment_sum"` writes every tap
       out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an
       offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
       `"spans"` paints large sprites row by row with running sums, at a cost that grows with the
@@ -111,23 +111,23 @@ def scatter(
     epsilon = parameter("scatter(epsilon=...)", epsilon)
     check("scatter(gamma=...)", gamma, lambda v: v >= 0, "0 or positive")
     check("scatter(epsilon=...)", epsilon, lambda v: v >= 0, "0 or positive")
-    option("scatter(kernel=...)", kernel, get_args(Kernel))
+    option("scatter(program=...)", program, get_args(Program))
     option("scatter(coverage=...)", coverage, tuple(COVERAGES))
-    if coverage == "indicator" and kernel != "segment_sum":
+    if coverage == "indicator" and program != "segment_sum":
         raise ValueError(
-            '`scatter(coverage="indicator")` must go with `kernel="segment_sum"`, '
-            f"got {kernel!r}."
+            '`scatter(coverage="indicator")` must go with `program="segment_sum"`, '
+            f"got {program!r}."
         )
-    if kernel == "auto":
-        # From the data where they can be looked at, else from what they may hold; the kernels
+    if program == "auto":
+        # From the data where they can be looked at, else from what they may hold; the programs
         # themselves go no farther, tile by tile, than what they do hold.
         largest = largest_of("scatter", depth, lens)
         room = max_coc if largest is None else min(max_coc, largest)
         height, width = depth.shape
-        kernels = cheapest(height, width, room), "rows"
+        programs = cheapest(height, width, room), "rows"
     else:
-        kernels = kernel, kernel
-    return _scatter(image, depth, lens, gamma, epsilon, max_coc, kernels, coverage)
+        programs = program, program
+    return _scatter(image, depth, lens, gamma, epsilon, max_coc, programs, coverage)
 
 
 def to_sprites(
@@ -164,10 +164,10 @@ def to_sprites(
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8))
 def _in_or_out_of_focus(
-    image, depth, lens, gamma, epsilon, missing, max_coc, kernels, coverage
+    image, depth, lens, gamma, epsilon, missing, max_coc, programs, coverage
 ):
     """A picture wholly in focus is itself; its derivative is computed like any other."""
-    blurred = ft.partial(_blurred, max_coc=max_coc, kernels=kernels, coverage=coverage)
+    blurred = ft.partial(_blurred, max_coc=max_coc, programs=programs, coverage=coverage)
 
     def is_sharp(_, depth, lens, *__):
         return (lens.circle_of_confusion(depth) < 2 * POINT_RADIUS).all()
@@ -177,27 +177,27 @@ def _in_or_out_of_focus(
 
 
 @_in_or_out_of_focus.defjvp
-def _in_or_out_of_focus_jvp(max_coc, kernels, coverage, primals, tangents):
-    blurred = ft.partial(_blurred, max_coc=max_coc, kernels=kernels, coverage=coverage)
+def _in_or_out_of_focus_jvp(max_coc, programs, coverage, primals, tangents):
+    blurred = ft.partial(_blurred, max_coc=max_coc, programs=programs, coverage=coverage)
     return jax.jvp(blurred, primals, tangents)
 
 
-def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, kernels, coverage):
+def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, programs, coverage):
     """The quotient of the two sums, for finite pixels."""
     # Rematerialised: a reverse pass keeps the sprites, not the twenty planes they are made of.
     made = jax.checkpoint(to_sprites, static_argnums=5)
     sprites = made(image, depth, lens, gamma, epsilon, max_coc, missing)
-    if "segment_sum" in kernels:
+    if "segment_sum" in programs:
         sums = segment_sum(sprites, reach(max_coc), coverage)
     else:
-        planes = _kernel(*kernels)(reach(max_coc), to_planes(sprites))
+        planes = _program(*programs)(reach(max_coc), to_planes(sprites))
         sums = jnp.moveaxis(planes, 0, -1)
     return _quotient(with_own(sums, image, missing))
 
 
 @ft.cache
-def _kernel(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
-    """The sums by one kernel where the program is lowered for a CPU, by the other elsewhere."""
+def _program(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
+    """The sums by one program where the program is lowered for a CPU, by the other elsewhere."""
     return with_adjoint(*_PROGRAMS[cpu], plain, _PROGRAMS[accelerator])
 
 
@@ -216,29 +216,29 @@ def _quotient_jvp(primals, tangents):
     return result, (dot[..., :-1] - result * dot[..., -1:]) / sums[..., -1:]
 
 
-def cheapest(height: int, width: int, max_coc: int | float) -> Kernel:
-    """The kernel that takes a CPU least for a picture whose every sprite is the largest.
+def cheapest(height: int, width: int, max_coc: int | float) -> Program:
+    """The program that takes a CPU least for a picture whose every sprite is the largest.
 
     Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows * columns)`, with
     `2 * reach + 1` rows and, in tiles, as many columns as their runs of taps come to; the
     constants were measured on two cores. What is fixed stands for the
-    time that a kernel takes to compile, shared by a few dozen pictures.
+    time that a program takes to compile, shared by a few dozen pictures.
     """
     pixels, far = height * width, reach(max_coc)
     rows = 2 * far + 1
 
-    def seconds(kernel: str) -> float:
-        fixed, once, row, tap = _SECONDS[kernel]
-        columns = 2 * farthest(far) + 1 if kernel == "tiles" else rows
+    def seconds(program: str) -> float:
+        fixed, once, row, tap = _SECONDS[program]
+        columns = 2 * farthest(far) + 1 if program == "tiles" else rows
         return fixed + 1e-9 * pixels * (once + row * rows + tap * rows * columns)
 
     return min(_SECONDS, key=seconds)
 
 
-@ft.partial(jax.jit, static_argnames=("max_coc", "kernels", "coverage"))
-def _scatter(image, depth, lens, gamma, epsilon, max_coc, kernels, coverage):
+@ft.partial(jax.jit, static_argnames=("max_coc", "programs", "coverage"))
+def _scatter(image, depth, lens, gamma, epsilon, max_coc, programs, coverage):
     seen = pixels(image, depth, lens)
     operands = seen.image, seen.depth, lens, gamma, epsilon, seen.missing
-    result = _in_or_out_of_focus(*operands, max_coc, kernels, coverage)
+    result = _in_or_out_of_focus(*operands, max_coc, programs, coverage)
     spoils = spoiled(seen.bad, lens.circle_of_confusion(seen.depth), max_coc) | seen.lost
     return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)

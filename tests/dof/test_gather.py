@@ -56,7 +56,7 @@ def quarter(image):
     return ndimage.convolve(low, kernel, mode="nearest")
 
 
-def loop(image, depth, lens, taps, softness):
+def loop(image, depth, lens, taps, ramp):
     defocus = np.asarray(lens.defocus(jnp.asarray(depth)))
     defocus = np.clip(defocus, -MAX_COC, MAX_COC)
     low, result = quarter(image), np.empty_like(image)
@@ -69,8 +69,8 @@ def loop(image, depth, lens, taps, softness):
             blur = abs(tap) / MAX_COC
             color = (1 - blur) * read(image, *at)
             color = color + blur * read(low, (i + 0.5) / 4 + 0.4 * dx, (j + 0.5) / 4 + 0.4 * dy)
-            if softness:
-                behind = np.clip(1 - (centre - tap) / softness, 0, 1)
+            if ramp:
+                behind = np.clip(1 - (centre - tap) / ramp, 0, 1)
             else:
                 behind = float(tap >= centre - 1e-13)
             weight = behind + (1 - behind) * blur
@@ -79,14 +79,14 @@ def loop(image, depth, lens, taps, softness):
     return result
 
 
-@first(("taps", "softness"), [(None, 0.0), (None, 1.5), (19, 1.5)], 2)
+@first(("taps", "ramp"), [(None, 0.0), (None, 1.5), (19, 1.5)], 2)
 @pytest.mark.parametrize("lens", [ThinLens(0.3, 3.0, 60.0), PLANES], ids=["thin", "planes"])
-def test_equals_the_loop(taps, softness, lens):
+def test_equals_the_loop(taps, ramp, lens):
     image, depth = scene()
     points = POISSON if taps is None else vogel(taps)
-    result = dof.gather(image, depth, lens, max_coc=MAX_COC, taps=taps, softness=softness)
+    result = dof.gather(image, depth, lens, max_coc=MAX_COC, taps=taps, ramp=ramp)
     np.testing.assert_allclose(
-        result, loop(image, depth, lens, points, softness), rtol=1e-11, atol=1e-11
+        result, loop(image, depth, lens, points, ramp), rtol=1e-11, atol=1e-11
     )
 
 
@@ -124,7 +124,7 @@ def test_a_bad_pixel_spoils_what_reads_it():
     [
         ({"taps": 0}, "taps"),
         ({"taps": 2.5}, "taps"),
-        ({"softness": -1.0}, "softness"),
+        ({"ramp": -1.0}, "ramp"),
         ({"max_coc": 0}, "max_coc"),
     ],
 )

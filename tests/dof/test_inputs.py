@@ -21,24 +21,24 @@ MISSING = [0.0, -0.0, -3.0, -np.inf, np.nan]
 
 METHODS = {
     **{
-        f"scatter {kernel}": ft.partial(dof.scatter, kernel=kernel, gamma=0.5)
-        for kernel in ("segment_sum", "shift", "tiles", "spans", "rows")
+        f"scatter {program}": ft.partial(dof.scatter, program=program, gamma=0.5)
+        for program in ("segment_sum", "shift", "tiles", "spans", "rows")
     },
     "layered": dof.layered,
     "depth_sorted": dof.depth_sorted,
     "depth_sorted all": ft.partial(dof.depth_sorted, slices="all"),
     "gather": dof.gather,
-    "gather 13": ft.partial(dof.gather, taps=13, softness=0.5),
+    "gather 13": ft.partial(dof.gather, taps=13, ramp=0.5),
     "blend": dof.blend,
     "separable": dof.separable,
     "anisotropic_diffusion": dof.anisotropic_diffusion,
     "implicit_diffusion": dof.implicit_diffusion,
 }
-# All kernels of a function read their arguments in one place: the quick form takes one of them.
-SUMS = {f"scatter {kernel}" for kernel in ("shift", "tiles", "spans", "rows")}
-KERNELS = SUMS | {"depth_sorted all", "gather 13"}
+# All programs of a function read their arguments in one place: the quick form takes one of them.
+SUMS = {f"scatter {program}" for program in ("shift", "tiles", "spans", "rows")}
+PROGRAMS = SUMS | {"depth_sorted all", "gather 13"}
 EACH = [
-    pytest.param(name, marks=pytest.mark.full if name in KERNELS else ()) for name in METHODS
+    pytest.param(name, marks=pytest.mark.full if name in PROGRAMS else ()) for name in METHODS
 ]
 # In these a pixel without a circle shows what reaches it; in the others its own colour.
 SPREADING = {name for name in METHODS if name.split()[0] in ("scatter", "layered", "separable")}
@@ -160,16 +160,16 @@ def test_scatter_of_holes_is_the_mean_of_all_others():
     np.testing.assert_allclose(drawn("scatter shift")(image, depth, LENS), expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("kernel", ["shift", "tiles", "spans", "rows"])
+@pytest.mark.parametrize("program", ["shift", "tiles", "spans", "rows"])
 @pytest.mark.full
-def test_kernels_of_scatter_agree_about_holes(kernel):
+def test_kernels_of_scatter_agree_about_holes(program):
     image, depth = scene(3, (30, 34))
     depth[np.random.default_rng(4).random(depth.shape) < 0.2] = 0
     depth[8:16, 10:22] = np.nan
     planes = FocusPlanes(0.5, 2.0, 9.0, 5.0)
     for lens in (LENS, planes):
         expected = drawn("scatter segment_sum")(image, depth, lens)
-        found = drawn(f"scatter {kernel}")(image, depth, lens)
+        found = drawn(f"scatter {program}")(image, depth, lens)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -15,7 +15,7 @@ from jaxfx import FocusPlanes, ThinLens, dof
 from tests.helpers.forms import first
 
 
-KERNELS = ("segment_sum", "shift", "tiles", "spans", "rows")
+PROGRAMS = ("segment_sum", "shift", "tiles", "spans", "rows")
 
 
 def row_area(radius, row):
@@ -62,12 +62,12 @@ def random_scene(seed, height=9, width=11, channels=3):
     return jnp.asarray(image), jnp.asarray(depth)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_equals_the_loop(kernel):
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_equals_the_loop(program):
     image, depth = random_scene(0)
     lens = ThinLens(0.1, 2.5, 60.0)
     expected = loop(np.asarray(image), np.asarray(depth), lens, 1.3, 1.7)
-    result = dof.scatter(image, depth, lens, gamma=1.3, epsilon=1.7, kernel=kernel)
+    result = dof.scatter(image, depth, lens, gamma=1.3, epsilon=1.7, program=program)
     # The loop's quadrature is good to about 1e-6.
     np.testing.assert_allclose(result, expected, atol=5e-6)
 
@@ -87,9 +87,9 @@ def test_kernels_agree(seed, gamma, epsilon, coc):
                 gamma=gamma,
                 epsilon=epsilon,
                 max_coc=12,
-                kernel=kernel,
+                program=program,
             )
-            for kernel in (*KERNELS, "auto")
+            for program in (*PROGRAMS, "auto")
         ]
         for result in results[1:]:
             assert result.dtype == dtype
@@ -106,7 +106,7 @@ def test_a_point_of_light_keeps_its_energy_and_place(radius):
     image = jnp.zeros((size, size, 1)).at[side, side].set(1.0)
     depth = jnp.full((size, size), jnp.inf)
     lens = ThinLens(1.0, 1.0, 2 * radius) if radius else ThinLens(0.0, 1.0, 1.0)
-    blur = lambda image: dof.scatter(image, depth, lens, max_coc=2 * largest, kernel="shift")
+    blur = lambda image: dof.scatter(image, depth, lens, max_coc=2 * largest, program="shift")
     spread = np.asarray(blur(image))[..., 0]
     offset = np.arange(size) - side
     # Where nothing is cut by the frame, the weights are those of a full disc.
@@ -173,26 +173,26 @@ def test_constant_linear_and_mirrored(seed, gamma, epsilon):
 
 
 @first("shape", [(1, 1, 1), (1, 7, 3), (7, 1, 4), (13, 5, 2)])
-@first("kernel", KERNELS)
+@first("program", PROGRAMS)
 @pytest.mark.full
-def test_any_size(shape, kernel):
+def test_any_size(shape, program):
     image, depth = random_scene(5, *shape)
     lens = ThinLens(0.1, 2.5, 200.0)
-    blur = lambda *data: dof.scatter(*data, lens, max_coc=13, kernel=kernel)
+    blur = lambda *data: dof.scatter(*data, lens, max_coc=13, program=program)
     result = jax.jit(blur)(image, depth)
     np.testing.assert_allclose(
-        result, dof.scatter(image, depth, lens, kernel="segment_sum"), atol=1e-12
+        result, dof.scatter(image, depth, lens, program="segment_sum"), atol=1e-12
     )
     assert np.isfinite(result).all()
 
 
-@first("kernel", KERNELS)
-def test_a_bad_pixel_spoils_what_it_can_reach_and_no_more(kernel):
+@first("program", PROGRAMS)
+def test_a_bad_pixel_spoils_what_it_can_reach_and_no_more(program):
     image, depth = random_scene(6, 31, 31)
     depth = jnp.full_like(depth, 5.0)
     lens = ThinLens(0.1, 2.5, 200.0)  # C = 4, so two pixels and a half
     rows, columns = np.mgrid[:31, :31] - 15
-    blur = jax.jit(lambda i, d: dof.scatter(i, d, lens, max_coc=8, kernel=kernel))
+    blur = jax.jit(lambda i, d: dof.scatter(i, d, lens, max_coc=8, program=program))
     good = np.asarray(blur(image, depth))
     for bad in (jnp.nan, jnp.inf, -jnp.inf):
         result = blur(image.at[15, 15, 1].set(bad), depth)
@@ -216,7 +216,7 @@ def test_indicator_costs_energy_that_area_keeps():
     assert max(error) > 0.3
     image, depth = random_scene(7)
     lens = ThinLens(0.1, 2.5, 60.0)
-    options = {"gamma": 1.0, "max_coc": 8, "kernel": "segment_sum"}
+    options = {"gamma": 1.0, "max_coc": 8, "program": "segment_sum"}
     area = dof.scatter(image, depth, lens, **options)
     indicator = dof.scatter(image, depth, lens, coverage="indicator", **options)
     difference = np.abs(area - indicator).max()
@@ -245,16 +245,16 @@ def inputs_of(seed, dtype=jnp.float64):
     )
 
 
-def picture(inputs, kernel, max_coc=8):
+def picture(inputs, program, max_coc=8):
     lens = ThinLens(*(inputs[k] for k in ("aperture", "focus_distance", "focal_pixels")))
     options = {k: inputs[k] for k in ("gamma", "epsilon")}
     return dof.scatter(
-        inputs["image"], inputs["depth"], lens, max_coc=max_coc, kernel=kernel, **options
+        inputs["image"], inputs["depth"], lens, max_coc=max_coc, program=program, **options
     )
 
 
 @ft.cache
-def compiled(kernel, is_twice=False):
+def compiled(program, is_twice=False):
     """One program: compiling is most of the work.
 
     The picture; the gradient of a weighted sum of it; both their derivatives along a direction,
@@ -262,14 +262,14 @@ def compiled(kernel, is_twice=False):
     """
 
     def gradient(inputs, weight):
-        blurred, pull = jax.vjp(lambda inputs: picture(inputs, kernel), inputs)
+        blurred, pull = jax.vjp(lambda inputs: picture(inputs, program), inputs)
         return blurred, *pull(weight)
 
     def derivatives(inputs, direction, weight):
         at, along = (inputs,), (direction,)
         if is_twice:
             return jax.jvp(lambda inputs: gradient(inputs, weight), at, along)
-        pushed = jax.jvp(lambda inputs: picture(inputs, kernel), at, along)[1]
+        pushed = jax.jvp(lambda inputs: picture(inputs, program), at, along)[1]
         return gradient(inputs, weight), (pushed, None)
 
     return jax.jit(derivatives)
@@ -278,9 +278,9 @@ def compiled(kernel, is_twice=False):
 SIGNS = jnp.asarray(np.sin(np.arange(9 * 11 * 3.0) ** 2).reshape(9, 11, 3))
 
 
-@first("kernel", KERNELS)
+@first("program", PROGRAMS)
 @pytest.mark.parametrize("name", [*PARAMETERS, "image", "depth"])
-def test_gradients(kernel, name):
+def test_gradients(program, name):
     inputs = inputs_of(8)
     direction = jax.tree.map(jnp.zeros_like, inputs)
     direction[name] = jnp.asarray(
@@ -289,11 +289,11 @@ def test_gradients(kernel, name):
 
     def loss(t):
         moved = jax.tree.map(lambda x, dx: x + t * dx, inputs, direction)
-        return np.vdot(SIGNS, compiled(kernel, True)(moved, direction, SIGNS)[0][0])
+        return np.vdot(SIGNS, compiled(program, True)(moved, direction, SIGNS)[0][0])
 
     expected = differences(loss, 0.0)
     assert abs(expected) > 1e-4
-    (_, gradient), (pushed, _) = compiled(kernel, True)(inputs, direction, SIGNS)
+    (_, gradient), (pushed, _) = compiled(program, True)(inputs, direction, SIGNS)
     np.testing.assert_allclose(np.vdot(SIGNS, pushed), expected, rtol=1e-6)
     np.testing.assert_allclose(np.vdot(gradient[name], direction[name]), expected, rtol=1e-6)
 
@@ -308,8 +308,8 @@ def test_gradients_with_one_tangent_only():
         np.testing.assert_allclose(alone, whole[name], atol=1e-10)
 
 
-@first("kernel", KERNELS)
-def test_gradient_at_a_silhouette(kernel):
+@first("program", PROGRAMS)
+def test_gradient_at_a_silhouette(program):
     """Two flat-coloured planes, the near one before half of the far one: where path tracers'
     thin lenses return zero."""
     names = ("aperture", "focus_distance")
@@ -320,7 +320,7 @@ def test_gradient_at_a_silhouette(kernel):
     zero = jax.tree.map(jnp.zeros_like, inputs)
     along = {name: zero | {name: jnp.ones(())} for name in names}
     edge = lambda picture: np.asarray(picture)[4, 2:9].mean(axis=-1)
-    run = compiled(kernel, True)
+    run = compiled(program, True)
     for name in names:
         moved = lambda t, n=name: edge(run(inputs | {n: inputs[n] + t}, along[n], SIGNS)[0][0])
         expected = differences(moved, 0.0)
@@ -346,8 +346,8 @@ DEGENERATE = {
 
 @first("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("case", DEGENERATE)
-@first("kernel", KERNELS)
-def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
+@first("program", PROGRAMS)
+def test_gradients_are_finite_where_they_degenerate(program, case, dtype):
     inputs = inputs_of(12, dtype)
     for name, value in DEGENERATE[case].items():
         if name == "depth":
@@ -355,15 +355,15 @@ def test_gradients_are_finite_where_they_degenerate(kernel, case, dtype):
         else:
             inputs[name] = jnp.asarray(value, dtype)
     direction = jax.tree.map(jnp.ones_like, inputs)
-    run = compiled(kernel, dtype == jnp.float64)
+    run = compiled(program, dtype == jnp.float64)
     (blurred, gradient), (pushed, _) = run(inputs, direction, SIGNS.astype(dtype))
     for leaf in jax.tree.leaves((blurred, gradient, pushed)):
         assert np.isfinite(leaf).all()
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("program", PROGRAMS)
 @pytest.mark.full
-def test_second_derivatives(kernel):
+def test_second_derivatives(program):
     inputs, zero = inputs_of(13), jax.tree.map(jnp.zeros_like, inputs_of(13))
     names = ("aperture", "focus_distance", "gamma", "epsilon")
     weight = SIGNS / SIGNS.size
@@ -371,11 +371,11 @@ def test_second_derivatives(kernel):
 
     def gradient(t, name):
         moved = inputs | {name: inputs[name] + t}
-        return select(compiled(kernel, True)(moved, zero, weight)[0][1])
+        return select(compiled(program, True)(moved, zero, weight)[0][1])
 
     unit = lambda name: zero | {name: jnp.ones(())}
     hessian = np.array(
-        [select(compiled(kernel, True)(inputs, unit(n), weight)[1][1]) for n in names]
+        [select(compiled(program, True)(inputs, unit(n), weight)[1][1]) for n in names]
     )
     expected = [differences(ft.partial(gradient, name=name), 0.0) for name in names]
     np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-7)
@@ -394,12 +394,12 @@ def test_half_images_keep_their_type():
 def test_focus_planes_are_a_lens():
     image, depth = random_scene(15)
     planes = FocusPlanes(1.0, 2.5, 8.0, 6.0)
-    blur = lambda kernel: (
+    blur = lambda program: (
         lambda image, depth: dof.scatter(
-            image, depth, planes, gamma=1.0, max_coc=6, kernel=kernel
+            image, depth, planes, gamma=1.0, max_coc=6, program=program
         )
     )
-    results = [jax.jit(blur(kernel))(image, depth) for kernel in KERNELS]
+    results = [jax.jit(blur(program))(image, depth) for program in PROGRAMS]
     np.testing.assert_allclose(results[0], results[1], atol=1e-12)
     assert np.abs(results[0] - image).max() > 0.1
 
@@ -412,9 +412,9 @@ BAD = {
     "gamma": ({"gamma": -1.0}, "scatter\\(gamma=...\\)"),
     "epsilon": ({"epsilon": -1.0}, "scatter\\(epsilon=...\\)"),
     "max_coc": ({"max_coc": -3}, "scatter\\(max_coc=...\\).*positive, got -3"),
-    "kernel": ({"kernel": "best"}, "scatter\\(kernel=...\\).*segment_sum.*'best'"),
+    "program": ({"program": "best"}, "scatter\\(program=...\\).*segment_sum.*'best'"),
     "coverage": ({"coverage": "round"}, "scatter\\(coverage=...\\).*area.*'round'"),
-    "indicator": ({"coverage": "indicator", "kernel": "shift"}, "segment_sum"),
+    "indicator": ({"coverage": "indicator", "program": "shift"}, "segment_sum"),
 }
 
 

@@ -8,7 +8,7 @@ from jaxfx import ThinLens, dof
 from tests.helpers.forms import first
 
 
-KERNELS = ("segment_sum", "shift", "tiles", "rows")
+PROGRAMS = ("segment_sum", "shift", "tiles", "rows")
 WIDTH, EDGE, RADIUS = 41, 20, 6.0
 COLUMNS = np.arange(WIDTH) + 0.5 - EDGE  # signed distance of a pixel's centre from the edge
 
@@ -44,7 +44,7 @@ def test_blurred_foreground_over_a_sharp_background(gamma):
     that share of its colour. Scatter gives V share / (1 + V share): up to 1/6 too little
     without amplification, and up to 0.42 too much with a gamma that suits another scene."""
     share = covered(COLUMNS, RADIUS)
-    result = edge(1.0, 2.0, 2.0, gamma=gamma, kernel="shift")
+    result = edge(1.0, 2.0, 2.0, gamma=gamma, program="shift")
     weight = 2.0**gamma * share
     np.testing.assert_allclose(result[SEEN], (weight / (1 + weight))[SEEN], atol=0.012)
     error = (result - share)[SEEN]
@@ -56,7 +56,7 @@ def test_blurred_foreground_over_a_sharp_background(gamma):
 def test_sharp_foreground_before_a_blurred_background(epsilon, leak):
     """Background must not leak into what is in focus: none does below the threshold, and with
     an epsilon larger than the blur itself the protection is gone."""
-    result = edge(1.0, 2.0, 1.0, epsilon=epsilon, kernel="shift")
+    result = edge(1.0, 2.0, 1.0, epsilon=epsilon, program="shift")
     leaked = (1 - result)[(COLUMNS < 0) & (COLUMNS > -RADIUS)]
     assert leaked.max() == pytest.approx(leak, abs=0.03)
     assert leaked.max() <= leak + 0.03
@@ -73,27 +73,27 @@ def test_a_thin_bar_in_focus_keeps_its_colour():
 
 
 @pytest.mark.parametrize("peak", [1e2, 1e4, 1e6])
-@first("kernel", KERNELS)
+@first("program", PROGRAMS)
 @pytest.mark.full
-def test_highlights_leave_dim_pixels_alone(kernel, peak):
+def test_highlights_leave_dim_pixels_alone(program, peak):
     rng = np.random.default_rng(0)
     image = rng.uniform(0.05, 0.2, (48, 48, 3))
     image[20, 24] = peak
     depth = rng.uniform(1.0, 8.0, (48, 48))
     lens = ThinLens(0.1, 2.5, 60.0)
-    exact = dof.scatter(jnp.asarray(image), jnp.asarray(depth), lens, kernel="segment_sum")
+    exact = dof.scatter(jnp.asarray(image), jnp.asarray(depth), lens, program="segment_sum")
     single = dof.scatter(
         jnp.asarray(image, jnp.float32),
         jnp.asarray(depth, jnp.float32),
         lens,
         max_coc=8,
-        kernel=kernel,
+        program=program,
     )
     dim = np.asarray(exact) < 0.2
     assert 0.9 < dim.mean() < 1
     error = np.abs(np.asarray(single) / np.asarray(exact) - 1)[dim]
     assert error.max() < 1e-3
-    # No sum of these kernels mixes a highlight with what it does not reach: rounding alone.
+    # No sum of these programs mixes a highlight with what it does not reach: rounding alone.
     assert np.median(error) < 1e-6
 
 

@@ -22,7 +22,7 @@ from tests.helpers.forms import first
 
 REACH = 21
 SHAPE = (BLOCK[0] + 7, BLOCK[1] + 9)
-KERNELS = {"shift": shift, "tiles": tiles, "spans": spans}
+PROGRAMS = {"shift": shift, "tiles": tiles, "spans": spans}
 
 
 def sprites(seed=0, shape=SHAPE, largest=2 * REACH, epsilon=1.7, dtype=np.float64):
@@ -37,9 +37,9 @@ def sprites(seed=0, shape=SHAPE, largest=2 * REACH, epsilon=1.7, dtype=np.float6
 
 
 @ft.cache
-def sums_and_gradient(kernel):
+def sums_and_gradient(program):
     def loss(sprites):
-        sums = KERNELS[kernel](sprites, REACH)
+        sums = PROGRAMS[program](sprites, REACH)
         weight = jnp.sin(jnp.arange(sums.size, dtype=sums.dtype) ** 2).reshape(sums.shape)
         return jnp.sum(weight * sums), sums
 
@@ -63,8 +63,8 @@ def test_many_blocks_have_the_same_gradient(field):
 
 
 @ft.cache
-def compiled(kernel):
-    return jax.jit(lambda sprites: KERNELS[kernel](sprites, 64))
+def compiled(program):
+    return jax.jit(lambda sprites: PROGRAMS[program](sprites, 64))
 
 
 @hyp.given(st.integers(0, 2**32 - 1), st.floats(0.01, 12), st.floats(2, 128))
@@ -75,9 +75,9 @@ def test_kernels_agree_to_a_radius_of_64(seed, epsilon, largest):
         given = sprites(seed, (33, 41), largest, epsilon, dtype)
         expected = compiled("shift")(given)
         scale = np.asarray(expected[..., -1:])
-        for kernel in ("tiles", "spans"):
-            difference = (compiled(kernel)(given) - expected) / scale
-            assert np.abs(difference).max() < tolerance, kernel
+        for program in ("tiles", "spans"):
+            difference = (compiled(program)(given) - expected) / scale
+            assert np.abs(difference).max() < tolerance, program
 
 
 @pytest.mark.parametrize("bright", [1e2, 1e4, 1e6])
@@ -97,27 +97,27 @@ def test_highlights_leave_dim_pixels_alone(bright, share):
     np.testing.assert_allclose(result, exact[:, 31:], rtol=1e-3)
 
 
-@first("kernel", KERNELS)
+@first("program", PROGRAMS)
 @pytest.mark.full
-def test_the_order_of_pixels_is_irrelevant(kernel):
+def test_the_order_of_pixels_is_irrelevant(program):
     # The picture of all is the sum of the pictures of any parts, taken in any order.
     given = sprites(7, (33, 41), 30.0)
     part = np.random.default_rng(8).integers(0, 3, given.radius.shape)
     only = lambda k: given._replace(value=jnp.where((part == k)[..., None], given.value, 0))
-    parts = [compiled(kernel)(only(k)) for k in (2, 0, 1)]
-    np.testing.assert_allclose(sum(parts), compiled(kernel)(given), atol=1e-12)
+    parts = [compiled(program)(only(k)) for k in (2, 0, 1)]
+    np.testing.assert_allclose(sum(parts), compiled(program)(given), atol=1e-12)
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize(("kernel", "reach"), [("shift", 8), ("tiles", 8), ("spans", 64)])
+@pytest.mark.parametrize(("program", "reach"), [("shift", 8), ("tiles", 8), ("spans", 64)])
 @pytest.mark.full
-def test_a_gradient_takes_at_most_24_pictures_of_memory(kernel, reach):
+def test_a_gradient_takes_at_most_24_pictures_of_memory(program, reach):
     shape = jax.ShapeDtypeStruct((512, 512, 3), jnp.float32)
     plane = jax.ShapeDtypeStruct((512, 512), jnp.float32)
 
     def loss(image, depth, aperture):
         lens = ThinLens(aperture, 2.5, 60.0)
-        blurred = dof.scatter(image, depth, lens, gamma=2.0, max_coc=2 * reach, kernel=kernel)
+        blurred = dof.scatter(image, depth, lens, gamma=2.0, max_coc=2 * reach, program=program)
         return jnp.sum(blurred**2)
 
     single = jax.ShapeDtypeStruct((), jnp.float32)
@@ -163,16 +163,16 @@ def test_auto_looks_at_the_data_where_it_can(monkeypatch):
     assert asked == [(5, 6, largest), (5, 6, 9), (5, 6, largest), (5, 6, largest)]
 
 
-@first("kernel", ["segment_sum", "shift", "tiles", "spans", "rows"])
+@first("program", ["segment_sum", "shift", "tiles", "spans", "rows"])
 @pytest.mark.full
-def test_solvers_run_on_every_kernel(kernel):
+def test_solvers_run_on_every_kernel(program):
     rng = np.random.default_rng(6)
     image = jnp.asarray(rng.random((12, 11, 1)))
     depth = jnp.asarray(rng.uniform(1.2, 6, (12, 11)))
 
     def residual(aperture, reference):
         lens = ThinLens(aperture, 2.5, 60.0)
-        blurred = dof.scatter(image, depth, lens, epsilon=0.7, max_coc=8, kernel=kernel)
+        blurred = dof.scatter(image, depth, lens, epsilon=0.7, max_coc=8, program=program)
         return blurred - reference
 
     tolerance = {"rtol": 1e-6, "atol": 1e-8}
