@@ -245,7 +245,7 @@ def warped(at: Point) -> Case:
     target = orbit(camera, at.own, distance)
     of = lambda method: (
         lambda images, depths, cameras, target: reproject.warp(
-            images[0], depths[0], cameras[0], target, method=method
+            images[0], depths[0], cameras[0], target, search=method
         )
     )
     few = lambda count: (
@@ -282,7 +282,7 @@ def searched(at: Point) -> Case:
 
     def of(method, steps):
         def call(depth, origin, direction):
-            how = {"method": method, "max_steps": steps}
+            how = {"search": method, "max_steps": steps}
             hit = reproject.intersect(depth, origin, direction, **how)
             return jnp.where(hit.mask, hit.position[..., 2], 1.0)[..., None]
 

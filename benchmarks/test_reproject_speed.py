@@ -93,7 +93,7 @@ def test_size(benchmark, slant):
 @pytest.mark.parametrize("method", ["pyramid", "descent", "linear", "relief"])
 def test_methods(benchmark, method):
     benchmark.group = "256 x 256 rays, slanting, by method"
-    run(benchmark, search(hills(256), *fan(256, SLANTS["slanting"]), method=method))
+    run(benchmark, search(hills(256), *fan(256, SLANTS["slanting"]), search=method))
 
 
 def test_a_batch(benchmark):

@@ -119,7 +119,9 @@ def new_view(stage: Stage, camera: PinholeCamera) -> GBuffer:
     here = jax.lax.stop_gradient(camera)
     images = [channels(*pair) for pair in zip(stage.caches, stage.cameras, strict=True)]
     depths = [cache.depth for cache in stage.caches]
-    image, alpha = reproject.blend(images, depths, stage.cameras, here, shape=stage.shape)
+    image, alpha = reproject.blend(
+        images, depths, stage.cameras, here, height=stage.shape[0], width=stage.shape[1]
+    )
     points, ambient, diffuse, specular, normal, kinds = (
         image[..., first : first + 3] for first in range(0, 18, 3)
     )

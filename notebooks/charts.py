@@ -165,7 +165,7 @@ show("reproject_time_still_life")
 case = atlas_cases.warped(atlas_cases.Point("still life", 96, 3))
 images, depths, cameras, target, _ = case.data
 for method in atlas_cases.SEARCHES:
-    _, alpha = reproject.warp(images[0], depths[0], cameras[0], target, method=method)
+    _, alpha = reproject.warp(images[0], depths[0], cameras[0], target, search=method)
     print(f"{method:8} draws {float(jnp.mean(alpha > 0)):4.0%}")
 
 # %% [markdown]

@@ -181,7 +181,7 @@ for column, slope in enumerate(SLOPES):
     ax = axes[3, column]
     for method, counts in LINES.items():
         searches = [
-            functools.partial(cases.run, fields["posts"], *rays, method=method, max_steps=count)
+            functools.partial(cases.run, fields["posts"], *rays, search=method, max_steps=count)
             for count in counts
         ]
         ax.plot(counts, [timed(search) for search in searches], "o-")

@@ -77,7 +77,7 @@ def _moving_shadow(**arguments):
 
 
 QUIET = {"progress": False, "throw": False, "max_steps": 1}
-PAIR = {"images": [IMAGE], "depths": [DEPTH], "sources": [CAMERA], "target": CAMERA}
+PAIR = {"images": [IMAGE], "depths": [DEPTH], "cameras": [CAMERA], "target": CAMERA}
 BLUR = {"image": IMAGE, "depth": DEPTH, "lens": LENS, "max_coc": 4.0}
 SHADOWED = {"shadow_map": MAP, "receivers": SEEN, "bias": 0.1, "slope_bias": 0.1}
 
@@ -91,7 +91,7 @@ CALLS = {
     "metrics.ssim": (metrics.ssim, {"image": IMAGE, "reference": IMAGE / 2, "data_range": 1.0}),
     "dof.scatter": (dof.scatter, BLUR | {"gamma": 0.5, "epsilon": 1.0}),
     "dof.layered": (dof.layered, BLUR | {"threshold": 2.0}),
-    "dof.gather": (dof.gather, BLUR | {"taps": 5, "softness": 1.0}),
+    "dof.gather": (dof.gather, BLUR | {"taps": 5, "ramp": 1.0}),
     "dof.blend": (dof.blend, BLUR),
     "dof.depth_sorted": (dof.depth_sorted, BLUR | {"slices": 3}),
     "dof.separable": (dof.separable, BLUR | {"epsilon": 1.0}),
@@ -108,7 +108,7 @@ CALLS = {
     "reproject.warp": (
         reproject.warp,
         {
-            **{"image": IMAGE, "depth": DEPTH, "source": CAMERA, "target": CAMERA},
+            **{"image": IMAGE, "depth": DEPTH, "camera": CAMERA, "target": CAMERA},
             **{"hole_threshold": 0.1},
         },
     ),

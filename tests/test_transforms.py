@@ -34,8 +34,8 @@ NO_PICTURES = {"shadow.candidates", "shadow.light_cameras"}
 
 # Options that a function hands to another one, with which they are tested.
 HANDED_ON = {
-    ("reproject.warp", "method"),
-    ("reproject.blend", "method"),
+    ("reproject.warp", "search"),
+    ("reproject.blend", "search"),
     ("reproject.blend", "target"),
     ("reproject.choose", "target"),
 }
@@ -147,10 +147,8 @@ EXAMPLES = {
     "light_camera": [orthographic, pinhole],
     "origin": [ray_origins],
     "direction": [lambda rng, size: rng.normal(size=(*size, 3)) * 0.1 + [0, 0, 1]],
-    "source": [turned],
     "images": [lambda rng, size: [rng.uniform(0.1, 1, (*size, 3)) for _ in range(2)]],
     "depths": [lambda rng, size: [rng.uniform(1.95, 2.05, size) for _ in range(2)]],
-    "sources": [lambda rng, size: [turned(rng, size) for _ in range(2)]],
     "normal": [lambda rng, size: rng.normal(size=(*size, 3))],
     "normal_offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "bias": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
@@ -187,6 +185,13 @@ EXAMPLES = {
     "baseline": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "softness": [lambda rng, size: np.array(rng.uniform(1, 2))],
+}
+
+# Examples of functions that take fewer types than others of that name.
+OWN_EXAMPLES = {
+    ("reproject.warp", "camera"): [turned],
+    ("reproject.blend", "cameras"): [lambda rng, size: [turned(rng, size) for _ in range(2)]],
+    ("reproject.choose", "cameras"): [lambda rng, size: [turned(rng, size) for _ in range(2)]],
 }
 
 # Choices that do not go together, which the function refuses by name.
@@ -269,13 +274,15 @@ def _functions():
     return found
 
 
-def _choices(parameter):
+def _choices(name, parameter):
     """What a parameter may be given: the values of its `Literal`, or the examples of its name.
 
     An option without an example keeps its default, unless it is one that JAX could trace.
     """
     if get_origin(parameter.annotation) is Literal:
         return sorted(get_args(parameter.annotation), key=lambda v: v != parameter.default)
+    if (name, parameter.name) in OWN_EXAMPLES:
+        return OWN_EXAMPLES[name, parameter.name]
     is_array = "jaxtyping" in inspect.formatannotation(parameter.annotation)
     if parameter.name not in EXAMPLES:
         is_needed = is_array or parameter.default is parameter.empty
@@ -287,7 +294,7 @@ def _choices(parameter):
 def _cases(name, function):
     """As few cases as hold every choice once, near the first ones; and what is left over."""
     parameters = inspect.signature(function).parameters.values()
-    choices = {p.name: _choices(p) for p in parameters}
+    choices = {p.name: _choices(name, p) for p in parameters}
     choices = {p: v[:1] if (name, p) in HANDED_ON else v for p, v in choices.items()}
     choices |= {p: [NEEDED[name, p]] for p in choices if (name, p) in NEEDED}
     if missing := [f"an example for `{name}`" for name in choices if not choices[name]]:
@@ -425,7 +432,7 @@ def test_reverse_mode_is_the_difference_quotient(case):
     backward, _, arguments, along = pulled(case)
     _, weight, slopes = backward(arguments)
     _assert_finite(slopes)
-    if case.choice.get("method") not in ROUGH:
+    if case.choice.get("search") not in ROUGH:
         product = _dot(weight, _quotient(backward, arguments, along))
         _assert_close(_dot(slopes, along), product, tolerance=1e-4)
 
@@ -457,7 +464,7 @@ def test_forward_mode_is_reverse_mode_and_everywhere_the_difference_quotient(cas
     reverse_out, weight, slopes = backward(arguments)
     _assert_close(reverse_out, out)
     _assert_close(_dot(weight, tangent), _dot(slopes, along), tolerance=1e-8)
-    if case.choice.get("method") not in ROUGH:
+    if case.choice.get("search") not in ROUGH:
         _assert_close(tangent, _quotient(forward, arguments, along), tolerance=1e-5)
 
 

@@ -83,14 +83,14 @@ def fan(side, slant):
     return origin.astype(np.float32), direction.astype(np.float32)
 
 
-run = jax.jit(intersect, static_argnames=("method", "max_steps", "surface"))
+run = jax.jit(intersect, static_argnames=("search", "max_steps", "surface"))
 
 
 def error_rate(depth, slope, method, max_steps=None):
     """The share of rays whose mask is wrong or whose hit is over a texel off."""
     origin, direction = slanted_rays(len(depth), slope)
     exact = run(depth, origin, direction)
-    hit = run(depth, origin, direction, method=method, max_steps=max_steps)
+    hit = run(depth, origin, direction, search=method, max_steps=max_steps)
     off = np.abs(np.asarray(hit.position - exact.position))[:, :2].max(axis=1) > 1
     wrong = np.asarray(hit.mask != exact.mask) | (off & np.asarray(exact.mask))
     return float(wrong.mean())

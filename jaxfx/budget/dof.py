@@ -125,13 +125,13 @@ def dof(
     stand for as many groups of tiles that a blur changes alike, or on all of it where it is
     small. The candidates: the image as it is; circles no larger than a power of two (the
     smallest that will do is searched by halving); sprites wider than 8 or 10 pixels in octaves,
-    the larger at the lower resolution; scatter's other program; the separable filter, diffusion,
-    blending, layers; and gather, with the number of taps that its variance asks for: from the
-    errors of two numbers of taps follow the part that more taps can lower and the part that
-    they can't. A candidate is dropped at the tile at which it errs too much or is too slow. Of
-    the others the quickest is measured on the whole scene and, if its error holds there, taken;
-    or else one that errs less, and at the last the effect itself. The effect goes no farther
-    in each tile than the largest circle that reaches it.
+    the larger at the lower resolution; another program of scatter; the separable filter,
+    diffusion, blending, layers; and gather, with the number of taps that its variance asks
+    for: from the errors of two numbers of taps follow the part that more taps can lower and
+    the part that they can't. A candidate is dropped at the tile at which it errs too much or is
+    too slow. Of the others the quickest is measured on the whole scene and, if its error holds
+    there, taken; or else one that errs less, and at the last the effect itself. The effect goes
+    no farther in each tile than the largest circle that reaches it.
 
     It costs one rendering for the proof, one by the plan (two or three if the tiles misled),
     and about as much as another for the tiles; at first also a program for each candidate.

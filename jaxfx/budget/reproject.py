@@ -20,7 +20,7 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.reproject.blend import Sight, blend, check_sources
 
 
-_OPTIONS = {"method": "pyramid", "hole_threshold": 0.1}
+_OPTIONS = {"search": "pyramid", "hole_threshold": 0.1}
 # What a pixel that no source shows any more adds to the squared error, in squared image units:
 # so much that it is never left out, since a plan keeps the coverage.
 _LOST = 1e30
@@ -59,9 +59,7 @@ class Everything(eqx.Module):
 
     def __call__(self, images: Any, depths: Any, cameras: Any, target: Any) -> Any:
         """The image and alpha, as `reproject.blend` gives them."""
-        if self.height is None or self.width is None:
-            return blend(images, depths, cameras, target)
-        return blend(images, depths, cameras, target, shape=(self.height, self.width))
+        return blend(images, depths, cameras, target, height=self.height, width=self.width)
 
 
 class Blend(eqx.Module):

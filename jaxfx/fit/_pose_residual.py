@@ -94,7 +94,7 @@ class Residual(eqx.Module):
         rows, columns, _ = views.reference.shape
         pixels = self._thinned(pixel_centers(rows, columns, views.depth.dtype))
         size, flat = pixels.shape[:2], pixels.reshape(-1, 2)
-        options = {"method": "pyramid", "hole_threshold": self.hole_threshold}
+        options = {"search": "pyramid", "hole_threshold": self.hole_threshold}
         view = look(views.depth, views.source, camera, flat, **options)
         is_clear = view.mask & nearest(self.clear, view.pixels)
         ignored = (~is_clear.reshape(size) | is_frame(size)).astype(float)

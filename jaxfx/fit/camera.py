@@ -192,7 +192,7 @@ def camera(
     """
     views = _views(reference, reference_depth, image, depth, camera, start)
     max_steps = whole_number("camera(max_steps=...)", max_steps)
-    check_options("camera", views.reference.shape[:2], "pyramid", hole_threshold)
+    check_options("camera", (None, None), views.reference.shape[:2], "pyramid", hole_threshold)
     option("camera(exposure=...)", exposure, get_args(Exposure))
     with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)

@@ -11,7 +11,7 @@ from jaxfx.reproject import _march, _walk
 from jaxfx.reproject._found import Found
 
 
-METHODS = {
+SEARCHES = {
     "pyramid": _walk.walk,
     "descent": _march.descend,
     "linear": _march.linear,
@@ -19,11 +19,11 @@ METHODS = {
 }
 
 
-def search(
+def first_crossing(
     depth: Float[Array, "height width"],
     origin: Float[Array, "ray 3"],
     direction: Float[Array, "ray 3"],
-    method: str,
+    search: str,
     max_steps: int | None,
     *,
     from_end: bool = False,
@@ -35,7 +35,7 @@ def search(
     infinite one would make that NaN.
     """
     held = map(jax.lax.stop_gradient, (depth, origin, direction))
-    found = _searcher(method, max_steps, from_end)(*held)
+    found = _searcher(search, max_steps, from_end)(*held)
     return found._replace(time=jnp.where(found.mask, found.time, 0))
 
 
@@ -43,9 +43,9 @@ _FOUND = jax.tree.structure(Found(*Found._fields))  # pyright: ignore[reportArgu
 
 
 @functools.cache
-def _searcher(method: str, max_steps: int | None, from_end: bool):
+def _searcher(search: str, max_steps: int | None, from_end: bool):
     def alone(depth, origin, direction):
-        return METHODS[method](depth, origin, direction, max_steps, from_end)
+        return SEARCHES[search](depth, origin, direction, max_steps, from_end)
 
     one = jax.custom_batching.custom_vmap(alone)
 

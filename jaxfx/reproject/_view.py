@@ -12,7 +12,7 @@ from jaxfx.reproject._found import TOP, X_SIDE, Y_SIDE, Found
 from jaxfx.reproject._grid import start
 from jaxfx.reproject._patch import Patch, is_apart, patch
 from jaxfx.reproject._rays import Camera, view_rays
-from jaxfx.reproject._search import search
+from jaxfx.reproject._search import first_crossing
 from jaxfx.reproject._surface import bilinear_point
 
 
@@ -36,7 +36,7 @@ def look(
     target: Camera,
     pixels: Float[Array, "ray 2"],
     *,
-    method: str,
+    search: str,
     hole_threshold: int | float,
     max_steps: int | None = None,
 ) -> View:
@@ -50,7 +50,7 @@ def look(
     field = jnp.where(known, -1 / jnp.where(known, depth / unit, 1), jnp.inf)
     rays = view_rays(source, target, pixels, shape=(height, width), unit=unit)
     line = rays.origin, rays.direction
-    found = search(field, *line, method, max_steps, from_end=True)
+    found = first_crossing(field, *line, search, max_steps, from_end=True)
     # A ray that ends at infinity meets what lies there, and nothing beyond.
     in_front = hold(line[0][:, 2] + found.time * line[1][:, 2]) <= 0
     found = found._replace(mask=found.mask & rays.inside & in_front)

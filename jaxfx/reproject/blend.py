@@ -1,14 +1,15 @@
-"""One picture from several sources, and which of many sources to take."""
+"""One image from several cameras, and which of many cameras to take."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Float, Num
 
+from jaxfx._choice import Choice
 from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._platform import by_platform
@@ -17,7 +18,7 @@ from jaxfx.camera import PinholeCamera
 from jaxfx.camera._rigid import per_depth
 from jaxfx.reproject._rays import Camera
 from jaxfx.reproject._view import View, look
-from jaxfx.reproject.intersect import Method
+from jaxfx.reproject.intersect import Search
 from jaxfx.reproject.warp import check_cameras, check_options, check_source
 
 
@@ -25,26 +26,15 @@ from jaxfx.reproject.warp import check_cameras, check_options, check_source
 _STRIDE = 8
 
 
-class Choice(NamedTuple):
-    """What `choose` gives.
-
-    - `chosen`: count, integers: which sources, the most useful first.
-    - `worth`: count, the mean over the target's pixels of the best cosine, in [0, 1], with the
-      sources up to each: where it no longer grows, more of them show nothing new.
-    """
-
-    chosen: Int[Array, " count"]
-    worth: Float[Array, " count"]
-
-
 def blend(
     images: Sequence[Float[ArrayLike, "height width channel"]],
     depths: Sequence[Num[ArrayLike, "height width"]],
-    sources: Sequence[PinholeCamera],
+    cameras: Sequence[PinholeCamera],
     target: Camera,
     *,
-    shape: tuple[int, int] | None = None,
-    method: Method = "pyramid",
+    height: WholeNumber | None = None,
+    width: WholeNumber | None = None,
+    search: Search = "pyramid",
     hole_threshold: Number = 0.1,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     """A picture from another camera out of several: each `warp`ed, the nearer surface first.
@@ -57,10 +47,11 @@ def blend(
 
     - `images`: pictures, each height width channel, linear radiance.
     - `depths`: the depth of each, height width, scene units, as in `warp`.
-    - `sources`: the camera of each.
+    - `cameras`: the camera of each.
     - `target`: the camera to see them from.
-    - `shape`: static; height and width of the result in pixels, the first picture's by default.
-    - `method`, `hole_threshold`: as in `warp`; the latter a ratio of depths.
+    - `height`, `width`: static; size of the result in pixels, both or neither; the first
+      image's by default.
+    - `search`, `hole_threshold`: as in `warp`; the latter a ratio of depths.
 
     **Returns:** `image`, rows columns channel, and `alpha`, rows columns, as `warp` does.
 
@@ -71,25 +62,25 @@ def blend(
     Source: the several references that Kim, Ki, Lee & Oh name as future work; the weights are
     our own.
     """
-    given = check_sources("blend", images, depths, sources, target)
-    images, depths, sources, target = given
-    size = check_options("blend", shape or images[0].shape[:2], method, hole_threshold)
-    options = {"method": method, "hole_threshold": float(hole_threshold)}
+    given = check_sources("blend", images, depths, cameras, target)
+    images, depths, cameras, target = given
+    size = check_options("blend", (height, width), images[0].shape[:2], search, hole_threshold)
+    options = {"search": search, "hole_threshold": float(hole_threshold)}
     seen = Sight(target, pixel_centers(*size).reshape(-1, 2), options)
-    return _blended(seen, images, depths, sources, size)
+    return _blended(seen, images, depths, cameras, size)
 
 
 @eqx.filter_jit
 def _blended(
-    seen: "Sight", images: list, depths: list, sources: list, size: tuple[int, int]
+    seen: "Sight", images: list, depths: list, cameras: list, size: tuple[int, int]
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     hole_threshold = seen.options["hole_threshold"]
 
-    def layer(image: Array, depth: Array, source: PinholeCamera) -> tuple[Array, ...]:
-        view, along, z = seen(depth, source)
+    def layer(image: Array, depth: Array, camera: PinholeCamera) -> tuple[Array, ...]:
+        view, along, z = seen(depth, camera)
         return view.patch.read_colors(image).astype(images[0].dtype), view.mask, along, z
 
-    pictures, masks, along, z = _over_sources(layer, images, depths, sources)
+    pictures, masks, along, z = _over_sources(layer, images, depths, cameras)
     nearest = jnp.min(jnp.where(masks, z, jnp.inf), axis=0)
     front = masks & (z <= (1 + hole_threshold) * nearest[None])
     weight = jax.lax.stop_gradient(jnp.where(front, along**8, 0))[..., None]
@@ -102,11 +93,12 @@ def _blended(
 
 def choose(
     depths: Sequence[Num[ArrayLike, "height width"]],
-    sources: Sequence[PinholeCamera],
+    cameras: Sequence[PinholeCamera],
     target: Camera,
     *,
     count: WholeNumber,
-    shape: tuple[int, int] | None = None,
+    height: WholeNumber | None = None,
+    width: WholeNumber | None = None,
     hole_threshold: Number = 0.1,
 ) -> Choice:
     """The few sources that together show most of a target.
@@ -118,11 +110,12 @@ def choose(
 
     **Arguments:**
 
-    - `depths`: the depth of each source, height width, scene units, as in `warp`.
-    - `sources`: the camera of each.
+    - `depths`: the depth of each camera, height width, scene units, as in `warp`.
+    - `cameras`: the camera of each.
     - `target`: the camera to see them from.
     - `count`: static; how many to choose.
-    - `shape`: static; height and width of the target in pixels, the first depth's by default.
+    - `height`, `width`: static; size of the target in pixels, both or neither; the first
+      depth's by default.
     - `hole_threshold`: static; as in `warp`, a ratio of depths.
 
     **Returns:** a `Choice`: `chosen` and `worth`, each of shape count, the most useful first.
@@ -134,27 +127,26 @@ def choose(
 
     Source: Nemhauser, Wolsey & Fisher 1978, the greedy choice's bound; the worth is our own.
     """
-    _check_lists("choose", depths=depths, sources=sources)
-    most = len(sources)
+    _check_lists("choose", depths=depths, cameras=cameras)
+    most = len(cameras)
     is_valid = lambda n: 1 <= n <= most
     count = whole_number("choose(count=...)", count, is_valid, f"an integer from 1 to {most}")
     depths = [check_map("choose(depths)", depth) for depth in depths]
-    size = shape or depths[0].shape
-    height, width = check_options("choose", size, "pyramid", hole_threshold)
-    rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in (height, width))
-    pixels = pixel_centers(height, width)[rows, columns].reshape(-1, 2)
-    depths = _checked("choose", depths, [depth.shape for depth in depths], sources, target)
-    options = {"method": "pyramid", "hole_threshold": float(hole_threshold)}
-    return _chosen(Sight(target, pixels, options), depths, list(sources), count)
+    size = check_options("choose", (height, width), depths[0].shape, "pyramid", hole_threshold)
+    rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in size)
+    pixels = pixel_centers(*size)[rows, columns].reshape(-1, 2)
+    depths = _checked("choose", depths, [depth.shape for depth in depths], cameras, target)
+    options = {"search": "pyramid", "hole_threshold": float(hole_threshold)}
+    return _chosen(Sight(target, pixels, options), depths, list(cameras), count)
 
 
 @eqx.filter_jit
-def _chosen(seen: "Sight", depths: list, sources: list, count: int) -> Choice:
-    def each(depth: Array, source: PinholeCamera) -> Array:
-        view, along, _ = seen(depth, source)
+def _chosen(seen: "Sight", depths: list, cameras: list, count: int) -> Choice:
+    def each(depth: Array, camera: PinholeCamera) -> Array:
+        view, along, _ = seen(depth, camera)
         return jnp.where(view.mask, along, 0)
 
-    worth, chosen = _over_sources(each, depths, sources), []
+    worth, chosen = _over_sources(each, depths, cameras), []
     best, reached = jnp.zeros_like(worth[0]), []
     free = jnp.ones(len(worth), bool)
     for _ in range(count):
@@ -167,13 +159,13 @@ def _chosen(seen: "Sight", depths: list, sources: list, count: int) -> Choice:
 
 
 def check_sources(
-    caller: str, images: Any, depths: Any, sources: Any, target: Any
+    caller: str, images: Any, depths: Any, cameras: Any, target: Any
 ) -> tuple[list[Array], list[Array], list[PinholeCamera], Camera]:
     """Pictures, depths and cameras, as lists; `ValueError` names a fault."""
-    _check_lists(caller, images=images, depths=depths, sources=sources)
+    _check_lists(caller, images=images, depths=depths, cameras=cameras)
     images = [check_image(f"{caller}(images)", image) for image in images]
-    depths = _checked(caller, depths, [image.shape[:2] for image in images], sources, target)
-    return images, depths, list(sources), target
+    depths = _checked(caller, depths, [image.shape[:2] for image in images], cameras, target)
+    return images, depths, list(cameras), target
 
 
 def _check_lists(caller: str, **lists: Any) -> None:
@@ -185,18 +177,18 @@ def _check_lists(caller: str, **lists: Any) -> None:
     if len(set(lengths.values())) > 1 or 0 in lengths.values():
         name = next(iter(lists))
         raise ValueError(
-            f"`{caller}({name})` must have an item for each source, at least one, "
+            f"`{caller}({name})` must have an item for each camera, at least one, "
             f"got lengths {lengths}."
         )
 
 
 def _checked(
-    caller: str, depths: Sequence, shapes: Sequence, sources: Sequence, target: Any
+    caller: str, depths: Sequence, shapes: Sequence, cameras: Sequence, target: Any
 ) -> list[Array]:
     """The depths as arrays of the given shapes, in types that are computed with."""
     depths = [check_source(caller, *each) for each in zip(depths, shapes, strict=True)]
-    for source in sources:
-        check_cameras(caller, source, target)
+    for camera in cameras:
+        check_cameras(caller, camera, target)
     return [depth.astype(working_dtype(depth.dtype)) for depth in depths]
 
 
@@ -220,16 +212,16 @@ class Sight(eqx.Module):
     options: dict[str, Any] = eqx.field(static=True)
 
     def __call__(
-        self, depth: Float[Array, "height width"], source: PinholeCamera
+        self, depth: Float[Array, "height width"], camera: PinholeCamera
     ) -> tuple[View, Float[Array, " ray"], Float[Array, " ray"]]:
         """The view, the cosine between the source's rays and the target's, and its depth."""
         pixels = self.pixels.astype(depth.dtype)
-        view = look(depth, source, self.target, pixels, **self.options)
-        rays, others = per_depth(source, view.pixels), per_depth(self.target, pixels)
+        view = look(depth, camera, self.target, pixels, **self.options)
+        rays, others = per_depth(camera, view.pixels), per_depth(self.target, pixels)
         cosine = jnp.sum(normalize(rays) * normalize(others), axis=-1)
         # No point of the world: its square overflows where a sky is at 1e20.
         at_infinity = view.inverse_depth <= 0
-        poses = source.world_from_camera, self.target.world_from_camera
+        poses = camera.world_from_camera, self.target.world_from_camera
         axis, away = poses[1][:3, 2], poses[0][:3, 3] - poses[1][:3, 3]
         along, offset = (
             jnp.sum(v * axis[None].astype(v.dtype), axis=-1)

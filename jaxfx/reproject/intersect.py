@@ -9,12 +9,12 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxfx._checks import WholeNumber, option, parameter, whole_number
 from jaxfx._numerics import working_dtype
-from jaxfx.reproject._search import search
+from jaxfx.reproject._search import first_crossing
 from jaxfx.reproject._surface import bilinear_point, texel_point
 from jaxfx.reproject._walk import LARGEST
 
 
-Method = Literal["pyramid", "descent", "linear", "relief"]
+Search = Literal["pyramid", "descent", "linear", "relief"]
 
 
 class Hit(NamedTuple):
@@ -41,7 +41,7 @@ def intersect(
     origin: Float[ArrayLike, "*ray 3"],
     direction: Float[ArrayLike, "*ray 3"],
     *,
-    method: Method = "pyramid",
+    search: Search = "pyramid",
     max_steps: WholeNumber | None = None,
     surface: Literal["texel", "bilinear"] = "texel",
 ) -> Hit:
@@ -64,7 +64,7 @@ def intersect(
       inf is never reached.
     - `origin`: ... 3, (x, y) in texels, pixel centres at +0.5, and depth. It may lie outside.
     - `direction`: ... 3, in the same units, of any length and sign; x, y or z may be 0.
-    - `method`: which search.
+    - `search`: which one finds the crossing.
     - `max_steps`: static; "pyramid": no ray takes more, None for as many as it needs;
       "descent": levels, None for all; "linear" and "relief": equal steps, None for 64.
     - `surface`: "texel" for the columns; "bilinear" moves each hit along its ray to the patch
@@ -72,7 +72,7 @@ def intersect(
 
     **Returns:** a `Hit`, in the type of `depth` or of the rays, whichever is wider.
 
-    **Raises:** `ValueError` for a wrong shape, a size over 8192, an unknown `method` or
+    **Raises:** `ValueError` for a wrong shape, a size over 8192, an unknown `search` or
     `surface`, or `max_steps` below 1.
 
     **Gradient:** exact for the point where a ray meets the column or the patch that it hits,
@@ -88,19 +88,19 @@ def intersect(
         parameter(f"intersect({name})", value, None)
         for name, value in (("depth", depth), ("origin", origin), ("direction", direction))
     )
-    _check(depth, origin, direction, method, max_steps, surface)
+    _check(depth, origin, direction, search, max_steps, surface)
     dtype = working_dtype(depth.dtype, origin.dtype, direction.dtype)
     depth, origin, direction = (x.astype(dtype) for x in (depth, origin, direction))
     steps = None if max_steps is None else int(max_steps)
-    return _intersect(depth, origin, direction, method, steps, surface)
+    return _intersect(depth, origin, direction, search, steps, surface)
 
 
 @eqx.filter_jit
-def _intersect(depth, origin, direction, method, max_steps, surface) -> Hit:
+def _intersect(depth, origin, direction, search, max_steps, surface) -> Hit:
     depth = jnp.where(depth > 0, depth, jnp.inf)
     batch = origin.shape[:-1]
     flat_origin, flat_direction = (x.reshape(-1, 3) for x in (origin, direction))
-    found = search(depth, flat_origin, flat_direction, method, max_steps)
+    found = first_crossing(depth, flat_origin, flat_direction, search, max_steps)
     if surface == "texel":
         point = texel_point(depth, flat_origin, flat_direction, found)
     else:
@@ -112,7 +112,7 @@ def _intersect(depth, origin, direction, method, max_steps, surface) -> Hit:
     )
 
 
-def _check(depth, origin, direction, method, max_steps, surface) -> None:
+def _check(depth, origin, direction, search, max_steps, surface) -> None:
     if depth.ndim != 2 or 0 in depth.shape or max(depth.shape) > LARGEST:
         raise ValueError(
             "`intersect(depth)` must have shape (height, width), each from 1 to "
@@ -126,13 +126,13 @@ def _check(depth, origin, direction, method, max_steps, surface) -> None:
             f"`intersect(direction)` must have the origin's shape {origin.shape}, "
             f"got {direction.shape}."
         )
-    check_method("intersect", method)
+    check_search("intersect", search)
     option("intersect(surface=...)", surface, ("texel", "bilinear"))
     if max_steps is not None:
         name, expected = "intersect(max_steps=...)", "a positive integer or None"
         whole_number(name, max_steps, expected=expected)
 
 
-def check_method(caller: str, method: str) -> None:
-    """Raise `ValueError` for a method that is none of the four."""
-    option(f"{caller}(method=...)", method, get_args(Method))
+def check_search(caller: str, search: str) -> None:
+    """Raise `ValueError` for a search that is none of the four."""
+    option(f"{caller}(search=...)", search, get_args(Search))

@@ -7,24 +7,25 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera
-from jaxfx._checks import Number, check_image, items, number, parameter, whole_number
+from jaxfx._checks import Number, WholeNumber, check_image, number, parameter, whole_number
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.reproject._rays import Camera
 from jaxfx.reproject._view import look
 from jaxfx.reproject._walk import LARGEST
-from jaxfx.reproject.intersect import Method, check_method
+from jaxfx.reproject.intersect import Search, check_search
 
 
 def warp(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
-    source: PinholeCamera,
+    camera: PinholeCamera,
     target: Camera,
     *,
-    shape: tuple[int, int] | None = None,
-    method: Method = "pyramid",
+    height: WholeNumber | None = None,
+    width: WholeNumber | None = None,
+    search: Search = "pyramid",
     hole_threshold: Number = 0.1,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     """A picture with depth, from another camera: what it shows, and where it shows something.
@@ -45,10 +46,11 @@ def warp(
     - `depth`: height width, scene units along the source's axis, inf for background. What is 0,
       negative or NaN is missing: a hole, at whose border a surface ends. Rays pass through it
       to what is known beyond, and nothing is read from it.
-    - `source`: the camera that took the picture, a pinhole.
+    - `camera`: the camera that took the picture, a pinhole.
     - `target`: the camera to see it from, a pinhole or an orthographic one.
-    - `shape`: static; height and width of the result in pixels, the picture's own by default.
-    - `method`: of the search, as in `intersect`.
+    - `height`, `width`: static; size of the result in pixels, both or neither; the image's own by
+      default.
+    - `search`: as in `intersect`.
     - `hole_threshold`: static; the step in depth between neighbours, as a ratio to the nearer
       one's depth, above which they are two surfaces with a gap between them. Smaller makes
       holes in slanted surfaces, larger draws skins between things.
@@ -58,7 +60,7 @@ def warp(
     gap or ends in a hole.
 
     **Raises:** `ValueError` for a wrong shape or size, a camera of another kind, an unknown
-    method or a threshold that is not positive.
+    search or a threshold that is not positive.
 
     **Gradient:** exact with respect to `image`, and to `depth` and both cameras through the
     point that each pixel shows; second derivatives are not. Missing: visibility. What comes
@@ -69,25 +71,25 @@ def warp(
     """
     image = check_image("warp(image)", image)
     depth = check_source("warp", depth, image.shape[:2])
-    check_cameras("warp", source, target)
-    shape = check_options("warp", shape or image.shape[:2], method, hole_threshold)
-    return _drawn(image, depth, source, target, shape, method, float(hole_threshold))
+    check_cameras("warp", camera, target)
+    shape = check_options("warp", (height, width), image.shape[:2], search, hole_threshold)
+    return _drawn(image, depth, camera, target, shape, search, float(hole_threshold))
 
 
 @eqx.filter_jit
 def _drawn(
     image: Array,
     depth: Array,
-    source: PinholeCamera,
+    camera: PinholeCamera,
     target: Camera,
     shape: tuple[int, int],
-    method: str,
+    search: str,
     hole_threshold: int | float,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
     dtype = working_dtype(depth.dtype)
     pixels = pixel_centers(*shape, dtype).reshape(-1, 2)
-    options = {"method": method, "hole_threshold": hole_threshold}
-    view = look(depth.astype(dtype), source, target, pixels, **options)
+    options = {"search": search, "hole_threshold": hole_threshold}
+    view = look(depth.astype(dtype), camera, target, pixels, **options)
     drawn = view.patch.read_colors(image)
     return drawn.reshape(*shape, -1), view.mask.astype(image.dtype).reshape(shape)
 
@@ -103,21 +105,28 @@ def check_source(caller: str, depth: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def check_cameras(caller: str, source: Any, target: Any) -> None:
+def check_cameras(caller: str, camera: Any, target: Any) -> None:
     """Raise `ValueError` for cameras of a kind that is not served."""
-    check_camera(f"{caller}(source)", source, PinholeCamera)
+    check_camera(f"{caller}(camera)", camera, PinholeCamera)
     check_camera(f"{caller}(target)", target)
 
 
 def check_options(
-    caller: str, shape: tuple[int, ...], method: str, hole_threshold: Any
+    caller: str,
+    size: tuple[Any, Any],
+    default: tuple[int, ...],
+    search: str,
+    hole_threshold: Any,
 ) -> tuple[int, int]:
-    """The shape, checked, and `ValueError` for an option out of range."""
-    check_method(caller, method)
+    """The height and width of the result; `ValueError` for an option out of range."""
+    check_search(caller, search)
     number(f"{caller}(hole_threshold=...)", hole_threshold, expected="a positive number")
-    name, expected = f"{caller}(shape=...)", "a height and a width in pixels"
-    sides = items(name, shape, expected)
-    if len(sides) != 2:
-        raise ValueError(f"`{name}` must be {expected}, got {shape}.")
-    height, width = (whole_number(name, side, expected=expected) for side in sides)
-    return height, width
+    if size == (None, None):
+        size = default[0], default[1]
+    for name, side, other in zip(("height", "width"), size, size[::-1], strict=True):
+        if side is None:
+            raise ValueError(
+                f"`{caller}({name}=...)` must be given with the other one, {other}, got None."
+            )
+        whole_number(f"{caller}({name}=...)", side, expected="a positive integer, in pixels")
+    return int(size[0]), int(size[1])

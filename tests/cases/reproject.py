@@ -104,11 +104,11 @@ def walked(depth: Any, origin: Any, direction: Any) -> tuple[np.ndarray, np.ndar
 
 SEARCHES: dict[str, dict[str, Any]] = {
     "pyramid": {},
-    "descent": {"method": "descent"},
-    "linear, 8 steps": {"method": "linear", "max_steps": 8},
-    "linear, 64 steps": {"method": "linear", "max_steps": 64},
-    "relief, 8 steps": {"method": "relief", "max_steps": 8},
-    "relief, 64 steps": {"method": "relief", "max_steps": 64},
+    "descent": {"search": "descent"},
+    "linear, 8 steps": {"search": "linear", "max_steps": 8},
+    "linear, 64 steps": {"search": "linear", "max_steps": 64},
+    "relief, 8 steps": {"search": "relief", "max_steps": 8},
+    "relief, 64 steps": {"search": "relief", "max_steps": 64},
 }
 QUICK = ("pyramid", "descent", "linear, 64 steps", "relief, 64 steps")
 AT_THE_HIT = "exact, at the hit; missing: which texel it is"
@@ -183,7 +183,7 @@ def same_camera(method):
     depth = rng.uniform(1, 9, (24, 32)).astype(dtype)
     depth[rng.random((24, 32)) < 0.2] = np.inf
     eye = scenes.camera(at=(3.1, -2.2, 0.7), turn=0.3)
-    drawn, alpha = map(np.asarray, warp(image, depth, eye, eye, method=search))
+    drawn, alpha = map(np.asarray, warp(image, depth, eye, eye, search=search))
     figures = {"image": float(np.abs(drawn - image).max()), "alpha": float((1 - alpha).max())}
     return Found(figures, drawn)
 

@@ -64,7 +64,7 @@ def test_the_choice_is_what_shows_most_and_then_what_it_lacks():
     eyes = [camera(*move) for move in moves]
     depths = [np.full((16, 24), 4.0), *(box_before_a_wall(eye)[1] for eye in eyes[1:])]
     target = camera(height=128, width=192)
-    chosen, worth = choose(depths, eyes, target, count=2, shape=(128, 192))
+    chosen, worth = choose(depths, eyes, target, count=2, height=128, width=192)
     # The nearest, and the one on the other side: not its neighbour, nor who looks away.
     assert chosen.tolist() == [2, 3]
     assert (np.diff(worth) >= 0).all() and 0 < worth[0] <= 1

@@ -84,7 +84,7 @@ def test_beside_holes_a_slanted_floor_is_what_a_splat_of_its_points_shows(method
     image = np.stack([x / width, y / height], axis=-1)
     holed = np.where(is_hole, rng.choice(MISSING, depth.shape), depth)
     hurt = np.where(is_hole[..., None], np.nan, image)
-    drawn, alpha = map(np.asarray, warp(hurt, holed, source, target, method=method))
+    drawn, alpha = map(np.asarray, warp(hurt, holed, source, target, search=method))
     assert np.isfinite(drawn).all() and not drawn[alpha == 0].any()
     where = shown >= 0
     of_hole = where & is_hole.ravel()[shown]
@@ -232,7 +232,7 @@ def test_derivatives_beside_a_hole_are_the_difference_quotients(hole):
 @first("method", ["pyramid", "linear"])
 def test_a_miss_makes_no_derivative_of_a_search_infinite(surface, method):
     search = lambda depth, origin, direction: (
-        intersect(depth, origin, direction, surface=surface, method=method).position
+        intersect(depth, origin, direction, surface=surface, search=method).position
     )
     both = derivatives(search)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5

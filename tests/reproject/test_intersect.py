@@ -69,7 +69,7 @@ def test_a_vertical_ray_meets_its_texel(method):
     y, x = np.mgrid[:5, :7] + 0.5
     origin = np.stack([x, y, np.zeros_like(x)], axis=-1)
     direction = np.broadcast_to([0.0, 0.0, 2.0], origin.shape)
-    hit = run(depth, origin, direction, method=method)
+    hit = run(depth, origin, direction, search=method)
     assert hit.mask.all()
     # Relief mapping ends within its last halving.
     tolerance = 2e-4 if method == "relief" else 1e-12
@@ -161,7 +161,7 @@ FAULTS = {
     "intersect(depth)": {"depth": np.ones(3)},
     "intersect(origin)": {"origin": np.ones((4, 2))},
     "intersect(direction)": {"direction": np.ones((5, 3))},
-    "intersect(method=...)": {"method": "fast"},
+    "intersect(search=...)": {"search": "fast"},
     "intersect(surface=...)": {"surface": "smooth"},
     "intersect(max_steps=...)": {"max_steps": 0},
 }

@@ -28,7 +28,7 @@ def test_the_same_camera_gives_the_same_picture(method):
     depth = rng.uniform(1, 9, (24, 32)).astype(np.float32)
     depth[rng.random((24, 32)) < 0.2] = np.inf
     eye = camera(at=(3.1, -2.2, 0.7), turn=0.3)
-    drawn, alpha = warp(image, depth, eye, eye, method=method)
+    drawn, alpha = warp(image, depth, eye, eye, search=method)
     np.testing.assert_array_equal(drawn, image)
     np.testing.assert_array_equal(alpha, 1)
     assert drawn.dtype == alpha.dtype == np.float32
@@ -206,7 +206,7 @@ def test_under_vmap_and_in_any_shape():
     def drawn(move):
         pose = jnp.eye(4).at[:3, 3].add(move)
         target = PinholeCamera(camera(5, 7).intrinsics, pose)
-        return warp(image, depth, camera(), target, shape=(5, 7))
+        return warp(image, depth, camera(), target, height=5, width=7)
 
     images, alphas = jax.jit(jax.vmap(drawn))(moves)
     assert images.shape == (2, 5, 7, 3) and alphas.shape == (2, 5, 7)
@@ -220,10 +220,11 @@ def test_under_vmap_and_in_any_shape():
 FAULTS = {
     "warp(image)": {"image": np.ones((4, 4))},
     "warp(depth)": {"depth": np.ones((4, 5))},
-    "warp(source)": {"source": OrthographicCamera(1.0, [0.0, 0.0], np.eye(4))},
+    "warp(camera)": {"camera": OrthographicCamera(1.0, [0.0, 0.0], np.eye(4))},
     "warp(target)": {"target": None},
-    "warp(shape=...)": {"shape": (0, 3)},
-    "warp(method=...)": {"method": "fast"},
+    "warp(height=...)": {"height": 0, "width": 3},
+    "warp(width=...)": {"height": 3},
+    "warp(search=...)": {"search": "fast"},
     "warp(hole_threshold=...)": {"hole_threshold": 0},
 }
 
