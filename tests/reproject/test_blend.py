@@ -84,7 +84,7 @@ def test_bad_arguments_are_named(name, fault):
     function, change = fault
     eye = camera()
     image, depth = box_before_a_wall(eye)
-    given = {"depths": [depth], "sources": [eye], "target": eye}
+    given = {"depths": [depth], "cameras": [eye], "target": eye}
     given |= {"images": [image]} if function is blend else {"count": 1}
     with pytest.raises(ValueError, match=re.escape(f"`{name}`")):
         inspect.unwrap(function)(**given | change)

@@ -234,7 +234,7 @@ def test_bad_arguments_are_named(name, fault):
     given = {
         "image": picture(),
         "depth": smooth_depth(),
-        "source": camera(),
+        "camera": camera(),
         "target": camera(),
     }
     with pytest.raises(ValueError, match=re.escape(f"`{name}`")):
