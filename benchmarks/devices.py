@@ -33,11 +33,10 @@ from benchmarks.native import cuda
 from benchmarks.scenes.discs import two_discs
 from jaxfx import GBuffer, PinholeCamera, PointLight, ThinLens, dof, relight, reproject, shadow
 from jaxfx._pyramid import minimum_pyramid
-from jaxfx.dof._inputs import pixels
-from jaxfx.dof._sprites import reach
-from jaxfx.dof._taps import to_planes
-from jaxfx.dof._tiles import TILES
+from jaxfx.dof.arguments import pixels
+from jaxfx.dof.kernels import TILES, to_planes
 from jaxfx.dof.scatter import to_sprites
+from jaxfx.dof.sprites import reach
 from jaxfx.fit._descent import _begin, _Objective, _step
 
 

@@ -32,7 +32,7 @@ from jaxfx import (
     scene,
     shadow,
 )
-from jaxfx.dof._inputs import largest_coc
+from jaxfx.dof.arguments import largest_coc
 
 
 SIZE, ERROR = (384, 512), 1e-2

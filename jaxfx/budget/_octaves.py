@@ -7,12 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import clip01
-from jaxfx.dof._inputs import pixels, with_own
-from jaxfx.dof._shift import shift
-from jaxfx.dof._spans import spans
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
-from jaxfx.dof._tiles import tiles
+from jaxfx.dof.arguments import pixels, with_own
+from jaxfx.dof.kernels import shift, spans, tiles
 from jaxfx.dof.scatter import cheapest, to_sprites
+from jaxfx.dof.sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.lens import Lens
 
 

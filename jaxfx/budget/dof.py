@@ -13,7 +13,7 @@ from jaxfx._checks import Number, check_depth, check_image, option
 from jaxfx.budget._octaves import octaves
 from jaxfx.budget._search import Part, Search, Trial, check_call, plan
 from jaxfx.budget.plan import Plan
-from jaxfx.dof._inputs import check_arguments, compiled, largest_coc, largest_of
+from jaxfx.dof.arguments import check_arguments, compiled, largest_coc, largest_of
 from jaxfx.dof.blend import blend
 from jaxfx.dof.diffusion import implicit_diffusion
 from jaxfx.dof.gather import gather

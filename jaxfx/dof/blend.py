@@ -14,7 +14,7 @@ from jaxfx._filter import folded
 from jaxfx._linear import linear
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._discs import vogel
-from jaxfx.dof._inputs import check_arguments, defocused
+from jaxfx.dof.arguments import check_arguments, defocused
 from jaxfx.dof.gather import mix
 from jaxfx.lens import Lens
 

@@ -10,10 +10,10 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._checks import Number, WholeNumber, whole_number
 from jaxfx._numerics import absolute, clip01
-from jaxfx.dof._inputs import check_arguments, defocused, with_own
-from jaxfx.dof._spoiled import spoiled
-from jaxfx.dof._sprites import POINT_RADIUS, coverage, reach, row_half_width
-from jaxfx.dof._tiles import sum_all
+from jaxfx.dof.arguments import check_arguments, defocused, with_own
+from jaxfx.dof.kernels._tiles import sum_all
+from jaxfx.dof.spoiled import spoiled
+from jaxfx.dof.sprites import POINT_RADIUS, coverage, reach, row_half_width
 from jaxfx.lens import Lens
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._checks import Number, check, parameter
 from jaxfx._platform import by_platform
-from jaxfx.dof._inputs import Defocused, check_arguments, defocused
+from jaxfx.dof.arguments import Defocused, check_arguments, defocused
 from jaxfx.lens import Lens
 
 

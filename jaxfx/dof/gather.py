@@ -13,7 +13,7 @@ from jaxfx._numerics import absolute, clip01
 from jaxfx._platform import by_platform
 from jaxfx._sampling import bilinear, pixel_centers
 from jaxfx.dof._discs import POISSON, vogel
-from jaxfx.dof._inputs import check_arguments, defocused, with_own
+from jaxfx.dof.arguments import check_arguments, defocused, with_own
 from jaxfx.lens import Lens
 
 

@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._checks import Number, check, check_depth, check_image, is_concrete, items, parameter
 from jaxfx._numerics import clip01, sum_planes
-from jaxfx.dof._inputs import check_arguments, compiled, defocused, with_own
-from jaxfx.dof._sheets import composited
-from jaxfx.dof._slices import SLICES, Extent, Sheets
-from jaxfx.dof._spoiled import spoiled
-from jaxfx.dof._sprites import POINT_RADIUS
+from jaxfx.dof.arguments import check_arguments, compiled, defocused, with_own
+from jaxfx.dof.kernels._layers import composited
+from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets
+from jaxfx.dof.spoiled import spoiled
+from jaxfx.dof.sprites import POINT_RADIUS
 from jaxfx.lens import Lens
 
 

@@ -11,15 +11,15 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._checks import Number, check, option, parameter
 from jaxfx._platform import either
-from jaxfx.dof._adjoint import with_adjoint
-from jaxfx.dof._inputs import check_arguments, largest_of, pixels, with_own
-from jaxfx.dof._rows import ROWS
-from jaxfx.dof._segment_sum import COVERAGES, segment_sum
-from jaxfx.dof._spans import SPANS
-from jaxfx.dof._spoiled import spoiled
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, reach
-from jaxfx.dof._taps import Planes, to_planes
-from jaxfx.dof._tiles import SHIFTS, TILES, farthest, plain
+from jaxfx.dof.arguments import check_arguments, largest_of, pixels, with_own
+from jaxfx.dof.kernels._adjoint import with_adjoint
+from jaxfx.dof.kernels._rows import ROWS
+from jaxfx.dof.kernels._segment_sum import COVERAGES, segment_sum
+from jaxfx.dof.kernels._spans import SPANS
+from jaxfx.dof.kernels._taps import Planes, to_planes
+from jaxfx.dof.kernels._tiles import SHIFTS, TILES, farthest, plain
+from jaxfx.dof.spoiled import spoiled
+from jaxfx.dof.sprites import POINT_RADIUS, Sprites, reach
 from jaxfx.lens import Lens
 
 
@@ -197,7 +197,7 @@ def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, programs, cov
 
 @ft.cache
 def _program(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
-    """The sums by one program where the program is lowered for a CPU, by the other elsewhere."""
+    """The sums by program `cpu` where they are lowered for a CPU, by `accelerator` elsewhere."""
     return with_adjoint(*_PROGRAMS[cpu], plain, _PROGRAMS[accelerator])
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Num
 from jaxfx._checks import Number, check, parameter
 from jaxfx._numerics import absolute
 from jaxfx._platform import by_platform
-from jaxfx.dof._inputs import OWN, check_arguments, defocused
-from jaxfx.dof._sprites import POINT_RADIUS, coverage, leak_rejection, reach
+from jaxfx.dof.arguments import OWN, check_arguments, defocused
+from jaxfx.dof.sprites import POINT_RADIUS, coverage, leak_rejection, reach
 from jaxfx.lens import Lens
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_lens
 from jaxfx._checks import check, check_depth, check_image, check_shape, items, option, parameter
-from jaxfx.dof._sprites import POINT_RADIUS
+from jaxfx.dof.sprites import POINT_RADIUS
 from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Pictures, Values
 from jaxfx.fit._lens_residual import Tone
 from jaxfx.lens import ThinLens

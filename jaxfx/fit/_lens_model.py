@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfx.dof._sprites import POINT_RADIUS, coverage, reach, row_half_width
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
+from jaxfx.dof.sprites import POINT_RADIUS, coverage, reach, row_half_width
 from jaxfx.fit._reduction import reduced, thinned
 from jaxfx.lens import ThinLens
 

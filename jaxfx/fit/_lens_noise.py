@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx.dof._spoiled import spoiled
+from jaxfx.dof.spoiled import spoiled
 from jaxfx.fit._lens_model import DISPARITY, LENS, Model, Values
 from jaxfx.fit._lens_residual import Residual, evaluate
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxfx.dof._inputs import largest_coc
+from jaxfx.dof.arguments import largest_coc
 from jaxfx.fit._descent import End
 from jaxfx.fit._lens_model import LENS, Model, Values
 from jaxfx.fit._lens_noise import weighed

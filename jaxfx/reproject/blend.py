@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
-from jaxfx._choice import Choice
 from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
+from jaxfx._choice import Choice
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers

@@ -48,8 +48,8 @@ def warp(
       to what is known beyond, and nothing is read from it.
     - `camera`: the camera that took the picture, a pinhole.
     - `target`: the camera to see it from, a pinhole or an orthographic one.
-    - `height`, `width`: static; size of the result in pixels, both or neither; the image's own by
-      default.
+    - `height`, `width`: static; size of the result in pixels, both or neither; the image's own
+      by default.
     - `search`: as in `intersect`.
     - `hole_threshold`: static; the step in depth between neighbours, as a ratio to the nearer
       one's depth, above which they are two surfaces with a gap between them. Smaller makes

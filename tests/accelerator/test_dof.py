@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from jaxfx import ThinLens, dof
-from jaxfx.dof import _sheets, diffusion
+from jaxfx.dof import diffusion
+from jaxfx.dof.kernels import _layers
 from jaxfx.dof.separable import _along_rows
+from tests.dof.kernels.test_layers import (
+    EXTENT,
+    assert_close,
+    check_derivatives,
+    in_plain_numpy,
+    random_sheets,
+)
 from tests.dof.test_diffusion import (  # noqa: F401
     test_a_point_of_light_has_the_variance_of_its_disc,
     test_energy_is_kept_and_nothing_rings,
@@ -27,13 +35,6 @@ from tests.dof.test_separable import (  # noqa: F401
     test_a_bad_pixel_spoils_its_square,
     test_a_point_of_light_has_the_variance_of_its_disc as test_a_point_keeps_its_variance,
     test_equals_the_loop,
-)
-from tests.dof.test_sheets import (
-    EXTENT,
-    assert_close,
-    check_derivatives,
-    in_plain_numpy,
-    random_sheets,
 )
 from tests.helpers.quick import check_slopes
 
@@ -85,7 +86,7 @@ def test_any_number_of_taps_together_gives_the_same_pass(together):
 def test_slices_are_composited_as_the_equations_have_it(slices):
     extent = EXTENT._replace(slices=slices)
     sheets = random_sheets(2)
-    composited = jax.jit(_sheets.composited, static_argnums=0)(extent, sheets)
+    composited = jax.jit(_layers.composited, static_argnums=0)(extent, sheets)
     assert_close(composited, in_plain_numpy(3, sheets))
 
 

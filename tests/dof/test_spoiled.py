@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxfx import ThinLens, dof
-from jaxfx.dof import _spoiled
-from jaxfx.dof._spoiled import spoiled
+from jaxfx.dof import spoiled as spoiled_module
+from jaxfx.dof.spoiled import spoiled
 from tests.helpers.forms import first
 from tests.helpers.programs import for_accelerators, primitives
 
@@ -57,9 +57,9 @@ def test_it_is_what_their_discs_overlap(max_coc, on):
 @pytest.mark.full
 def test_a_batch_computes_it_in_a_branch_alone(name, transform, monkeypatch):
     """The cover is marked by an operation that nothing else has."""
-    real = _spoiled.sum_all
+    real = spoiled_module.sum_all
     marked = lambda value, radius, reach: jnp.sinh(real(value, radius, reach))
-    monkeypatch.setattr(_spoiled, "sum_all", marked)
+    monkeypatch.setattr(spoiled_module, "sum_all", marked)
     jax.clear_caches()
     method = lambda image, depth: METHODS[name](image, depth, LENS)
     run = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxfx import ThinLens, dof
-from jaxfx.dof._sprites import coverage, row_half_width, segment_integral
+from jaxfx.dof.sprites import coverage, row_half_width, segment_integral
 from tests.helpers.forms import first
 
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.dof import _sheets
-from jaxfx.dof._slices import Extent, Sheets
+from jaxfx.dof.kernels import _layers
+from jaxfx.dof.kernels._slices import Extent, Sheets
 
 
 # Sprites reach 3 pixels; how many slices there are is for the data to say.
@@ -66,7 +66,7 @@ def assert_close(one, other):
 def test_slices_are_composited_as_the_equations_have_it():
     sheets = random_sheets(2)
     expected = in_plain_numpy(3, sheets)
-    for sums in (_sheets.composited, _sheets.plain):
+    for sums in (_layers.composited, _layers.plain):
         assert_close(jax.jit(functools.partial(sums, EXTENT))(sheets), expected)
 
 
@@ -78,8 +78,8 @@ def check_derivatives(extent):
 
     @jax.jit
     def derivatives(sheets, along):
-        dense = jax.jvp(functools.partial(_sheets.plain, extent), (sheets,), (along,))[1]
-        composited = functools.partial(_sheets.composited, extent)
+        dense = jax.jvp(functools.partial(_layers.plain, extent), (sheets,), (along,))[1]
+        composited = functools.partial(_layers.composited, extent)
         tangent = jax.jvp(composited, (sheets,), (along,))[1]
         # Itself is as good a direction to pull back as any.
         return tangent, dense, jax.vjp(composited, sheets)[1](dense)[0]

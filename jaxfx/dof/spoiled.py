@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._platform import by_platform, either
-from jaxfx.dof._sprites import POINT_RADIUS, reach, row_half_width
-from jaxfx.dof._tiles import sum_all
+from jaxfx.dof.kernels._tiles import sum_all
+from jaxfx.dof.sprites import POINT_RADIUS, reach, row_half_width
 
 
 def spoiled(

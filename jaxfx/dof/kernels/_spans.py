@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import clip01, sum_planes
-from jaxfx.dof import _tiles
-from jaxfx.dof._adjoint import Program, with_adjoint
-from jaxfx.dof._paint import paint, read_back
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites
-from jaxfx.dof._taps import Planes, inside, to_planes
+from jaxfx.dof.kernels import _tiles
+from jaxfx.dof.kernels._adjoint import Program, with_adjoint
+from jaxfx.dof.kernels._paint import paint, read_back
+from jaxfx.dof.kernels._taps import Planes, inside, to_planes
+from jaxfx.dof.sprites import POINT_RADIUS, Sprites
 
 
 # From this many epsilons on, the leak rejection no longer depends on the source.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfx._numerics import clip01
-from jaxfx.dof._sprites import Sprites
+from jaxfx.dof.sprites import Sprites
 
 
 class Sweep(NamedTuple):

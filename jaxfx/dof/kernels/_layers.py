@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfx._numerics import clip01, sum_planes
-from jaxfx.dof._adjoint import with_adjoint
-from jaxfx.dof._filling import (
+from jaxfx.dof.kernels._adjoint import with_adjoint
+from jaxfx.dof.kernels._compositing import (
     Filling,
     allowance,
     begin_reading,
@@ -19,8 +19,8 @@ from jaxfx.dof._filling import (
     nothing_filled,
     read_slice,
 )
-from jaxfx.dof._sheet_rows import SHEET_ROWS
-from jaxfx.dof._slices import (
+from jaxfx.dof.kernels._layer_rows import SHEET_ROWS
+from jaxfx.dof.kernels._slices import (
     APART,
     SLICES,
     Extent,
@@ -30,7 +30,7 @@ from jaxfx.dof._slices import (
     ordered,
     share_of,
 )
-from jaxfx.dof._sprites import POINT_RADIUS, row_half_width
+from jaxfx.dof.sprites import POINT_RADIUS, row_half_width
 
 
 def composited(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._numerics import sum_planes
-from jaxfx.dof._slices import Extent, Sheets
+from jaxfx.dof.kernels._slices import Extent, Sheets
 
 
 # A slice after all others.

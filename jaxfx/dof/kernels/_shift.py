@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfx.dof._sprites import Sprites, coverage, leak_rejection, row_half_width
+from jaxfx.dof.sprites import Sprites, coverage, leak_rejection, row_half_width
 
 
 def shift(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:

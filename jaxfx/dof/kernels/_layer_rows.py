@@ -20,10 +20,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxfx._numerics import clip01, sum_planes
-from jaxfx.dof._adjoint import Program
-from jaxfx.dof._filling import Filling, begin_reading, fill, nothing_filled, read_slice
-from jaxfx.dof._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
-from jaxfx.dof._sprites import segment_integral
+from jaxfx.dof.kernels._adjoint import Program
+from jaxfx.dof.kernels._compositing import (
+    Filling,
+    begin_reading,
+    fill,
+    nothing_filled,
+    read_slice,
+)
+from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
+from jaxfx.dof.sprites import segment_integral
 
 
 # Slices per group: 24 planes of sums, of RGB. With 8, XLA keeps the shares of every tap in

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._numerics import clip01, sum_planes
-from jaxfx.dof._paint import _add, _read
-from jaxfx.dof._spans import _too_bright
-from jaxfx.dof._sprites import POINT_RADIUS, reach, segment_integral
-from jaxfx.dof._tiles import inside
+from jaxfx.dof.kernels._paint import _add, _read
+from jaxfx.dof.kernels._spans import _too_bright
+from jaxfx.dof.kernels._tiles import inside
+from jaxfx.dof.sprites import POINT_RADIUS, reach, segment_integral
 
 
 # The steps of a block and of what its sprites reach fill half a megabyte at a radius of 32.

@@ -12,11 +12,11 @@ import optimistix as optx
 import pytest
 
 from jaxfx import ThinLens, dof
-from jaxfx.dof._paint import BLOCK
-from jaxfx.dof._shift import shift
-from jaxfx.dof._spans import spans
-from jaxfx.dof._sprites import Sprites
-from jaxfx.dof._tiles import tiles
+from jaxfx.dof.kernels._paint import BLOCK
+from jaxfx.dof.kernels._shift import shift
+from jaxfx.dof.kernels._spans import spans
+from jaxfx.dof.kernels._tiles import tiles
+from jaxfx.dof.sprites import Sprites
 from tests.helpers.forms import first
 
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.dof._paint import BLOCK, paint, read_back
-from jaxfx.dof._sprites import coverage, row_half_width
+from jaxfx.dof.kernels._paint import BLOCK, paint, read_back
+from jaxfx.dof.sprites import coverage, row_half_width
 
 
 REACH = 5

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
-from jaxfx.dof import _taps
-from jaxfx.dof._adjoint import Program
-from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
-from jaxfx.dof._taps import Sweep, inside
+from jaxfx.dof.kernels import _taps
+from jaxfx.dof.kernels._adjoint import Program
+from jaxfx.dof.kernels._taps import Sweep, inside
+from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
 # The most that one kernel takes, in taps times planes that are read; and in that times sums.

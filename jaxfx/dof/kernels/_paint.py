@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx.dof._sprites import POINT_RADIUS, segment_integral
+from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
 # Enough discs to spread a row's overhead; their steps fill a megabyte at a radius of 64.

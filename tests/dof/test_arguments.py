@@ -34,7 +34,7 @@ METHODS = {
     "anisotropic_diffusion": dof.anisotropic_diffusion,
     "implicit_diffusion": dof.implicit_diffusion,
 }
-# All programs of a function read their arguments in one place: the quick form takes one of them.
+# All programs of a function read their arguments in one place: the quick form takes one.
 SUMS = {f"scatter {program}" for program in ("shift", "tiles", "spans", "rows")}
 PROGRAMS = SUMS | {"depth_sorted all", "gather 13"}
 EACH = [

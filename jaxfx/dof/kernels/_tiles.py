@@ -22,12 +22,12 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxfx._platform import by_platform
-from jaxfx.dof import _taps
-from jaxfx.dof._adjoint import Program, with_adjoint
-from jaxfx.dof._rows import ROWS
-from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import POINT_RADIUS, Sprites, segment_integral
-from jaxfx.dof._taps import Planes, Sweep, clip, inside, stacked, to_planes
+from jaxfx.dof.kernels import _taps
+from jaxfx.dof.kernels._adjoint import Program, with_adjoint
+from jaxfx.dof.kernels._rows import ROWS
+from jaxfx.dof.kernels._shift import shift
+from jaxfx.dof.kernels._taps import Planes, Sweep, clip, inside, stacked, to_planes
+from jaxfx.dof.sprites import POINT_RADIUS, Sprites, segment_integral
 
 
 # Tall enough to spread a row's overhead, wide for the vector units, small enough for the cache.

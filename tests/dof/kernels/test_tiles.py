@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.dof._shift import shift
-from jaxfx.dof._sprites import Sprites
-from jaxfx.dof._tiles import TILE, _tile_reaches, tiles
+from jaxfx.dof.kernels._shift import shift
+from jaxfx.dof.kernels._tiles import TILE, _tile_reaches, tiles
+from jaxfx.dof.sprites import Sprites
 
 
 REACH = 18

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
-from jaxfx.dof._sprites import Sprites, coverage, leak_rejection, row_half_width
+from jaxfx.dof.sprites import Sprites, coverage, leak_rejection, row_half_width
 
 
 def _indicator(
