@@ -1,4 +1,17 @@
-"""Depth of field: pictures as a lens of finite aperture would take them."""
+"""Depth of field: images as a lens of finite aperture would take them.
+
+| I want | call |
+|---|---|
+| the best result from one image and its depth | `layered` |
+| the same where a second layer of depth is known | `layered(behind=(image, depth))` |
+| a preview in a tenth of the time | `separable` |
+| parameters fitted to a scene, second derivatives | `scatter`, by `fit.dof` |
+| the multi-pass reference of a renderer | `accumulate` |
+| methods of the literature, for comparison | `gather`, `blend`, `depth_sorted`, |
+| | `anisotropic_diffusion`, `implicit_diffusion` |
+
+All but `accumulate` are called with `(image, depth, lens, max_coc=...)` and give an image.
+"""
 
 from jaxfx.dof.accumulate import Accumulation, accumulate
 from jaxfx.dof.blend import blend

@@ -39,15 +39,15 @@ def accumulate(
     seed: WholeNumber = 0,
     progress: bool = False,
 ) -> Accumulation:
-    """Depth of field by many passes: the mean of pictures from points all over the lens.
+    """Depth of field by many passes: the mean of images from points all over the lens.
 
-    The points cover the disc with equal area, by a low-discrepancy sequence whose every prefix
-    covers it too. All cameras share the plane in focus.
+    It is the reference that the other methods approach. The points cover the disc with equal
+    area, by a low-discrepancy sequence whose every prefix covers it too.
 
     **Arguments:**
 
     - `render`: from a camera to an image, height width channel, linear radiance. Anything
-      serves: a rasteriser, a ray tracer, a reprojection of one picture. Integers are taken as
+      serves: a rasteriser, a ray tracer, a reprojection of one image. Integers are taken as
       they are, for floats.
     - `camera`: the pinhole camera at the lens' centre.
     - `lens`: its `aperture` and `focus_distance` are used, in scene units.
@@ -61,10 +61,21 @@ def accumulate(
     (JAX's default for integers), summed in float32 at least; and `convergence`.
 
     **Raises:** `ValueError` where `samples` is not a positive integer, the lens is not a
-    `ThinLens`, or a picture is none, or changes its shape on the way.
+    `ThinLens`, or `render` returns no image, or images of different shapes.
 
     **Gradient:** that of `render`, through its camera: exact in the aperture, the focus
     distance and the camera where `render` is. A rasteriser's is zero or missing.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import PinholeCamera, ThinLens, dof
+    >>> camera = PinholeCamera.from_fov(1.0, height=8, width=8)
+    >>> lens = ThinLens.from_camera(camera, aperture=0.1, focus_distance=2.0)
+    >>> dof.accumulate(lambda eye: jnp.ones((8, 8, 3)), camera, lens, samples=4).image.shape
+    (8, 8, 3)
+
+    All cameras share the plane in focus.
 
     Source: Haeberli & Akeley 1990, the accumulation buffer. The sequence is Roberts' 2018
     generalization of the golden ratio to four dimensions.

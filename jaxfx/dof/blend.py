@@ -29,12 +29,11 @@ def blend(
     *,
     max_coc: Number | None = None,
 ) -> Float[Array, "height width channel"]:
-    """Depth of field by a blurred copy: `lerp(image, blur, clamp(C / max_coc))`.
+    """Depth of field by mixing the image with a blurred copy of it. Kept for comparison.
 
-    The blur is the mean of the pixel and 12 taps about it, twice, as wide at every pixel as the
-    largest circle of confusion: what is a little out of focus shows its sharp self through a
-    wide blur, the blur of a sharp foreground leaks into its background, and at large radii the
-    taps show.
+    The copy is blurred as widely at every pixel as the largest circle of confusion: a pixel
+    slightly out of focus shows its sharp self through a wide blur, a sharp foreground leaks
+    into its background, and at large radii the taps show.
 
     **Arguments:**
 
@@ -54,6 +53,18 @@ def blend(
 
     **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; zero where a
     circle is clamped.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.blend(image, depth, lens).shape
+    (8, 8, 3)
+
+    The result is `lerp(image, blur, clamp(C / max_coc))`. The blur is the mean of the pixel and
+    12 taps about it, applied twice.
 
     Source: simple depth of field, the two blurs and the lerp, in which the share was
     `clamp(range * |focus - Z|)`. Reconstructed: where its 12 taps lie (here a Vogel spiral,

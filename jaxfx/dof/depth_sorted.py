@@ -29,18 +29,10 @@ def depth_sorted(
     max_coc: Number | None = None,
     slices: WholeNumber | Literal["all"] = 8,
 ) -> Float[Array, "height width channel"]:
-    """Depth of field by point sprites in order of depth, with partial visibility.
+    """Depth of field by point sprites in order of depth: each fills what nearer ones leave.
 
-    Every pixel p covers a share `a_p = coverage(q - p; C_p / 2) / area(C_p / 2)` of the lens as
-    q sees it. From front to back, each sprite is visible in what the nearer ones have left:
-    `v_p = clamp(1 - sum of nearer a, 0, a_p)`, in one proportion for all of equal depth; the
-    result is the mean under v. Sprites of one surface add up to 1 at any slant and whatever the
-    order, so that an opaque plane stays opaque; a blurred edge hides what is behind it by the
-    share of the lens that it covers, with no amplification to be set.
-
-    What is hidden in the picture is missing: under a blurred edge the background is taken from
-    the rest of it. Shares of two surfaces are taken to be disjoint, so that two overlapping
-    blurred edges hide too much.
+    A blurred edge hides what is behind it by the share of the lens that it covers, with no
+    amplification to be set. Kept for comparison: `layered` does this more exactly.
 
     **Arguments:**
 
@@ -64,6 +56,25 @@ def depth_sorted(
     **Gradient:** exact with respect to `image`, `depth` and every field of `lens`; in the last
     two, zero where a circle is below a pixel or above `max_coc`. With `slices="all"` that of
     the order itself is missing: where two surfaces change places, the result jumps.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.depth_sorted(image, depth, lens).shape
+    (8, 8, 3)
+
+    Every source pixel p covers a share `a_p = coverage(q - p; C_p / 2) / area(C_p / 2)` of the
+    lens as q sees it. From front to back, each sprite is visible in what the nearer ones have
+    left: `v_p = clamp(1 - sum of nearer a, 0, a_p)`, in one proportion for all of equal depth;
+    the result is the mean under v. Sprites of one surface add up to 1 at any slant and in any
+    order, so that an opaque plane stays opaque.
+
+    What is hidden in the image is missing: under a blurred edge the background is taken from
+    the rest of it. Shares of two surfaces are taken to be disjoint, so that two overlapping
+    blurred edges hide too much.
 
     Source: Potmesil & Chakravarty 1981, partial visibility of a sprite; Demers 2004, blending
     in order of depth. Reconstructed: the order is kept front to back, since "over" of single

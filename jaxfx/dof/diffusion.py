@@ -33,16 +33,10 @@ def anisotropic_diffusion(
     max_coc: Number | None = None,
     edge: Float[ArrayLike, ""] | float = 4.0,
 ) -> Float[Array, "height width channel"]:
-    """Depth of field by explicit heat flow that stops at depth edges.
+    """Depth of field by explicit heat flow that stops at depth edges. Kept for comparison.
 
-    `dI/dt = div(g grad I)` for a time of 1, with
-    `g = min(C_p, C_q)^2 / 32 / (1 + ((D_p - D_q) / edge)^2)` between neighbours p and q, C
-    their circles of confusion and D their signed defocus, in
-    `ceil(max_coc^2 / 8)` steps, the fewest that are stable.
-
-    Its point is a Gaussian, not a disc. Nothing crosses a silhouette, so a blurred foreground
-    keeps its hard outline; a bar narrower than its blur keeps its colour. Time grows with the
-    square of the radius.
+    A point becomes a Gaussian, not a disc, and nothing crosses a silhouette: a blurred
+    foreground keeps its hard outline. Time grows with the square of the radius.
 
     **Arguments:**
 
@@ -62,6 +56,22 @@ def anisotropic_diffusion(
 
     **Gradient:** exact with respect to `image`, `depth`, `edge` and every field of `lens`; zero
     where a circle is clamped. Its memory grows with the root of the number of steps.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.anisotropic_diffusion(image, depth, lens).shape
+    (8, 8, 3)
+
+    `dI/dt = div(g grad I)` for a time of 1, with
+    `g = min(C_p, C_q)^2 / 32 / (1 + ((D_p - D_q) / edge)^2)` between neighbours p and q, C
+    their circles of confusion and D their signed defocus, in
+    `ceil(max_coc^2 / 8)` steps, the fewest that are stable.
+
+    A bar that is narrower than its blur keeps its colour.
 
     Source: Bertalmio, Fort & Sanchez-Crespo 2004, depth of field as anisotropic diffusion.
     Reconstructed: the form of the stop at an edge. Our own: the scale of the conductance, which
@@ -84,11 +94,8 @@ def implicit_diffusion(
 ) -> Float[Array, "height width channel"]:
     """Depth of field by two implicit steps of heat flow, in constant time at any radius.
 
-    Solves `u - d(g du/dx)/dx = image` along rows, then `v - d(g dv/dy)/dy = u` along columns:
-    two tridiagonal systems, with the conductance g of `anisotropic_diffusion`.
-
-    Its point is the product of two exponentials, cusped and with long tails, in place of a
-    disc; the order of rows and columns shows where g changes. Nothing crosses a silhouette.
+    A point becomes the product of two exponentials, with a cusp and long tails, and nothing
+    crosses a silhouette. Kept for comparison.
 
     **Arguments:**
 
@@ -108,6 +115,20 @@ def implicit_diffusion(
 
     **Gradient:** exact with respect to `image`, `depth`, `edge` and every field of `lens`, by
     the implicit function, in the memory of a few images; zero where a circle is clamped.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.implicit_diffusion(image, depth, lens).shape
+    (8, 8, 3)
+
+    Solves `u - d(g du/dx)/dx = image` along rows, then `v - d(g dv/dy)/dy = u` along columns:
+    two tridiagonal systems, with the conductance g of `anisotropic_diffusion`.
+
+    The order of rows and columns shows where g changes.
 
     Source: Kass, Lefohn & Owens 2006, interactive depth of field using simulated diffusion: the
     two solves and the smaller conductance at a border. Reconstructed: one layer only, theirs

@@ -31,18 +31,11 @@ def gather(
     taps: WholeNumber | None = None,
     ramp: Float[ArrayLike, ""] | float = 1.0,
 ) -> Float[Array, "height width channel"]:
-    """Depth of field by taps on the pixel's own circle of confusion, with a test of leaks.
+    """Depth of field by a few taps on each pixel's circle of confusion. Kept for comparison.
 
-    With the signed defocus D, the circle of confusion C and the blurriness b = C / `max_coc`,
-    the result at q is the mean of the taps `q + disc[i] * C_q / 2`, each
-
-    - mixed from the picture and a low-resolution one (a quarter of the width and the height,
-      blurred by a 3x3 Gaussian, read at 0.4 of the radius in its own pixels) by the tap's b;
-    - weighted by 1 if the tap lies behind q, and by its own b if it lies in front: what is in
-      focus does not leak onto what is behind it.
-
-    A pixel gathers over its own circle, not over those that reach it: a blurred foreground
-    keeps a hard rim before a background in focus. Eight taps are too few beyond some 10 pixels.
+    A pixel gathers over its own circle of confusion, not over those that reach it: a blurred
+    foreground keeps a hard rim before a background in focus. Eight taps are too few for circles
+    of confusion beyond some 10 pixels.
 
     **Arguments:**
 
@@ -53,8 +46,8 @@ def gather(
     - `max_coc`: static; the largest diameter, in pixels, to which larger ones are clamped, and
       that of a pixel whose b is 1. Outside `jit`, `grad` and `vmap` it may be left out.
     - `taps`: how many, on a Vogel spiral; None for the paper's eight Poisson points.
-    - `ramp`: pixels of defocus over which a tap turns from behind into in front. 0 is the
-      paper's own step, `D_tap >= D_q`.
+    - `ramp`: pixels; the difference in defocus over which a tap goes from behind to in front. 0
+      is the paper's own step, `D_tap >= D_q`.
 
     **Returns:** height width channel, in the type of `image`. A pixel that is not a number
     spoils what reads it: 0.8 `max_coc` + 10 pixels away along each axis, at the most. One whose
@@ -68,8 +61,28 @@ def gather(
     slopes between pixels are those to the right and below. With a `ramp` of 0 the
     derivative of the leak test is missing.
 
-    Source: Scheuermann 2004, advanced depth of field: the low-resolution picture, the taps, the
-    scales and the leak test. Reconstructed: what bounds a picture whose sides are no multiples
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.gather(image, depth, lens).shape
+    (8, 8, 3)
+
+    With the signed defocus D, the circle of confusion C and the blurriness b = C / `max_coc`,
+    the result at q is the mean of the taps `q + disc[i] * C_q / 2`, each
+
+    - mixed from the image and a low-resolution one (a quarter of the width and the height,
+      blurred by a 3x3 Gaussian, read at 0.4 of the radius in its own pixels) by the tap's b;
+    - weighted by 1 if the tap lies behind q, and by its own b if it lies in front: so that a
+      surface in focus does not leak onto what is behind it.
+
+    A pixel gathers over its own circle, not over those that reach it: a blurred foreground
+    keeps a hard rim before a background in focus. Eight taps are too few beyond some 10 pixels.
+
+    Source: Scheuermann 2004, advanced depth of field: the low-resolution image, the taps, the
+    scales and the leak test. Reconstructed: the border of an image whose sides are no multiples
     of 4 (its last row and column are repeated). Our own: the Vogel spiral, `ramp`, and that
     the leak test reads the tap at full resolution, so that the centre always counts.
     """

@@ -36,16 +36,56 @@ def layered(
     | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
 ) -> Float[Array, "height width channel"]:
-    """Depth of field by point sprites that are composited at every pixel, without a gamma.
+    """Depth of field with occlusion: point sprites composited per pixel from front to back.
+
+    It is the most accurate method from one image, needs no `gamma`, and takes a second layer of
+    depth where there is one. Time is 2.4 to 3.3 times that of `scatter`.
+
+    **Arguments:**
+
+    - `image`: height width channel, linear radiance.
+    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
+      or NaN where it is missing.
+    - `lens`: gives each depth its signed defocus, in pixels.
+    - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
+      Outside `jit`, `grad` and `vmap` it may be left out and is then taken from `depth`.
+    - `behind`: the image and depth of the next surface that faces the camera behind the first,
+      shaped as `image` and `depth`; its depth is inf where there is none, or as in `depth`
+      where it is missing.
+    - `threshold`: pixels; how much the defocus changes from slice to slice. One default
+      serves all scenes that were tried. Below a 128th of `max_coc` it is that.
+
+    **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
+    number spoils what its sprite can reach. One whose depth is missing has no sprite: it shows
+    what reaches it or, where nothing does, its own colour.
+
+    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
+    `threshold`, or no `max_coc` under a transform.
+
+    **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
+    every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
+    where a circle of confusion is below a pixel or above `max_coc`: a search cannot leave a
+    lens all of whose circles are. There is no kink where neighbours have one depth or a surface
+    is in focus. At the others, the ends of a clamp and a lens that is just filled, each sprite
+    and pixel has the value of one side.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.layered(image, depth, lens).shape
+    (8, 8, 3)
 
     A sprite that arrives at a pixel stands for a share of the pixel's lens: its coverage over
     its area, times `1 - (p - q) . grad log(defocus)`, for a surface whose defocus changes turns
     towards one side of the lens. The shares of the surfaces that a lens sees add up to one. So
     sprites fill it from the front: sorted into slices of defocus, `threshold` wide, each slice
     takes what room is left, and what lies behind a full lens is hidden. Where the lens is not
-    filled, since what it sees there is in no picture, the mean of what has arrived stands for
-    the rest, each part of it weighted by 0.1 and what was filled when it arrived: what is not
-    seen lies rather behind.
+    filled, since the image does not hold what it sees there, the mean of what has arrived
+    stands for the rest, each contribution weighted by 0.1 plus the share that was filled when
+    it arrived: surfaces that are not seen rather lie behind.
 
     A slanted floor is thereby one surface, whatever slices it is cut into: their shares add up.
     Slices are painted by spans, at a cost that grows with the radius, and its gradient's with
@@ -60,34 +100,6 @@ def layered(
     What it does badly: what no layer shows is guessed from its surroundings, as is what lies
     beyond the frame, where the last pixels are repeated. Within a slice nothing hides anything.
     Two edges one before the other are taken to hide different parts of the lens.
-
-    **Arguments:**
-
-    - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
-      or NaN where it is missing.
-    - `lens`: gives each depth its signed defocus, in pixels.
-    - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
-      Outside `jit`, `grad` and `vmap` it may be left out and is then taken from `depth`.
-    - `behind`: the image and depth of the next surface that faces the camera behind the first,
-      shaped as `image` and `depth`; its depth is inf where there is none, or as in `depth`
-      where it is missing.
-    - `threshold`: pixels; how much the defocus changes from slice to slice. The default serves
-      all scenes that we know. Below a 128th of `max_coc` it is that.
-
-    **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
-    number spoils what its sprite can reach. One whose depth is missing has no sprite: it shows
-    what reaches it or, where nothing does, its own colour.
-
-    **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
-    `threshold`, or no `max_coc` under a transform.
-
-    **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
-    every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
-    where a circle of confusion is below a pixel or above `max_coc`: no search leaves a lens all
-    of whose circles are. There is no kink where neighbours have one depth or a surface is in
-    focus. At the others, the ends of a clamp and a lens that is just filled, each sprite and
-    pixel has the value of one side.
 
     Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
     pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.

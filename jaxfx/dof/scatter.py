@@ -55,13 +55,8 @@ def scatter(
 ) -> Float[Array, "height width channel"]:
     """Depth of field by point sprites: every pixel is spread over its circle of confusion.
 
-    The result at q is the mean of all pixels p, weighted by
-    `K * coverage(q - p; C_p / 2) / area(C_p / 2)`, with C the diameter of the circle of
-    confusion and
-
-    - `K = (focus_distance / depth_p) ** gamma` for a foreground pixel (virtual visibility),
-    - `K = 1 - clamp((C_p - C_q) / epsilon) * (1 - clamp(C_q / epsilon - 1))` for any other:
-      background is kept from leaking onto what is in focus.
+    It is the method whose `gamma` and `epsilon` are fitted to a scene (`fit.dof`), with exact
+    derivatives of first and second order. `gamma` is no display gamma.
 
     **Arguments:**
 
@@ -74,11 +69,11 @@ def scatter(
     - `epsilon`: pixels; circles of confusion below it count as in focus.
     - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
-    - `program`: which program computes the sums, all the same: `"segment_sum"` writes every tap
-      out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image an
-      offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
+    - `program`: which program computes the sums; the result is the same. `"segment_sum"` writes
+      every tap out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image
+      an offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
       `"spans"` paints large sprites row by row with running sums, at a cost that grows with the
-      radius, not its square, `"rows"` adds all offsets of a row at once over the whole picture.
+      radius, not its square, `"rows"` adds all offsets of a row at once over the whole image.
       `"auto"` is `"rows"` where the program is compiled for an accelerator; on a CPU it is the
       cheapest of the three before it by a model of their time, outside of transforms for the
       largest circle in the data, else for `max_coc`.
@@ -95,9 +90,26 @@ def scatter(
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
     `lens`, silhouettes included, forward and reverse; again by `jax.jacfwd(jax.grad(loss))`,
     which `jax.hessian` is. In `lens` and `depth`, zero where a circle of confusion is below a
-    pixel or above `max_coc`: no search leaves a lens all of whose circles are. At a kink (the
-    focus plane, the ends of both clamps) one of the two one-sided values. With
+    pixel or above `max_coc`: a search cannot leave a lens all of whose circles are. At a kink
+    (the focus plane, the ends of both clamps) one of the two one-sided values. With
     `coverage="indicator"` that of the coverage, almost everywhere zero, is missing.
+
+    **Example:**
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import ThinLens, dof
+    >>> image, depth = jnp.ones((8, 8, 3)), jnp.full((8, 8), 4.0)
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> dof.scatter(image, depth, lens, gamma=0.5).shape
+    (8, 8, 3)
+
+    The result at target pixel q is the mean of all source pixels p, weighted by
+    `K * coverage(q - p; C_p / 2) / area(C_p / 2)`, with C the diameter of the circle of
+    confusion and
+
+    - `K = (focus_distance / depth_p) ** gamma` for a foreground pixel (virtual visibility),
+    - `K = 1 - clamp((C_p - C_q) / epsilon) * (1 - clamp(C_q / epsilon - 1))` for any other:
+      so that background does not leak onto pixels in focus.
 
     Source: Lee, Kim & Choi, real-time depth of field rendering using pixel intensity scatter on
     GPU, sections 3 and 4; the model is that of Potmesil & Chakravarty 1981. Our own: the exact
@@ -197,7 +209,7 @@ def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, programs, cov
 
 @ft.cache
 def _program(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
-    """The sums by program `cpu` where they are lowered for a CPU, by `accelerator` elsewhere."""
+    """The sums by program `cpu` if lowered for a CPU, by `accelerator` elsewhere."""
     return with_adjoint(*_PROGRAMS[cpu], plain, _PROGRAMS[accelerator])
 
 
