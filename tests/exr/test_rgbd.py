@@ -44,10 +44,11 @@ CLEAN = np.where(np.arange(6)[:, None] == 0, np.inf, np.full(SIZE, 2.5))
 def test_blender_multilayer(tmp_path, dtype, sky):
     path = tmp_path / "a.exr"
     blender(path, {"ViewLayer": depth(sky)}, dtype)
-    found_image, found_depth = exr.read_rgbd(path)
-    assert found_image.dtype == found_depth.dtype == np.float32
-    np.testing.assert_array_equal(found_image, image())
-    np.testing.assert_array_equal(found_depth, CLEAN)
+    rgbd = exr.read_rgbd(path)
+    assert rgbd._fields == ("image", "depth")
+    assert rgbd.image.dtype == rgbd.depth.dtype == np.float32
+    np.testing.assert_array_equal(rgbd.image, image())
+    np.testing.assert_array_equal(rgbd.depth, CLEAN)
 
 
 @pytest.mark.full
