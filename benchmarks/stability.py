@@ -23,6 +23,8 @@ import numpy as np
 from PIL import Image
 from tqdm.auto import tqdm
 
+from jaxfx.io import srgb_from_linear
+
 
 if TYPE_CHECKING:
     from tests.cases.registry import Case
@@ -83,7 +85,7 @@ def thumbnail(picture: Any) -> np.ndarray:
     tile = tile[np.ix_(y, x)]
     bad = np.isnan(tile).any(axis=-1)
     tile = np.clip(np.nan_to_num(tile), 0, 1)
-    curve = np.where(tile <= 0.0031308, 12.92 * tile, 1.055 * tile ** (1 / 2.4) - 0.055)
+    curve = srgb_from_linear(tile)
     curve[bad] = (0.8, 0.1, 0.1)
     return np.round(255 * curve).astype(np.uint8)
 

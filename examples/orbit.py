@@ -7,6 +7,7 @@ sheet with the turned views and, for a mesh, the same views rendered anew.
 """
 
 import argparse
+from io import BytesIO
 from pathlib import Path
 
 import jax
@@ -15,7 +16,8 @@ import numpy as np
 from _begin import fail, make_folder
 from PIL import Image
 
-from jaxfx import PinholeCamera, exr, relight, reproject, scene
+from jaxfx import PinholeCamera, exr, io, relight, reproject, scene
+from jaxfx._files import write_whole
 
 
 # Pictures on the contact sheet.
@@ -88,8 +90,14 @@ def hatched(image, alpha) -> np.ndarray:
 def to_bytes(image) -> np.ndarray:
     """sRGB bytes of linear radiance."""
     value = np.clip(np.asarray(image, float), 0, 1)
-    curve = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.round(255 * curve).astype(np.uint8)
+    return np.round(255 * io.srgb_from_linear(value)).astype(np.uint8)
+
+
+def write_image(image: Image.Image, path: Path, **options) -> None:
+    """Write an image file, whole or not at all."""
+    buffer = BytesIO()
+    image.save(buffer, path.suffix[1:].upper(), **options)
+    write_whole(path, buffer.getvalue())
 
 
 def main() -> None:
@@ -110,15 +118,14 @@ def main() -> None:
         np.arange(arguments.frames) * 2 * np.pi / arguments.frames
     )
     frames = [Image.fromarray(to_bytes(drawn(degrees))) for degrees in turns]
-    frames[0].save(
-        out / "orbit.gif", save_all=True, append_images=frames[1:], duration=60, loop=0
-    )
+    animation = {"save_all": True, "append_images": frames[1:], "duration": 60, "loop": 0}
+    write_image(frames[0], out / "orbit.gif", **animation)
     stops = np.linspace(-arguments.degrees, arguments.degrees, SHEET)
     rows = [[drawn(degrees) for degrees in stops]]
     if render is not None:
         rows.append([np.asarray(render(turned(eye, degrees, distance))) for degrees in stops])
     sheet = np.concatenate([np.concatenate(list(map(to_bytes, row)), axis=1) for row in rows])
-    Image.fromarray(sheet).save(out / "orbit.png")
+    write_image(Image.fromarray(sheet), out / "orbit.png")
     share = float(np.mean(view(turned(eye, arguments.degrees, distance))[1]))
     print(f"at {arguments.degrees:g} degrees {100 * share:.0f} % of the pixels are known")
     print(f"wrote {out / 'orbit.gif'} and {out / 'orbit.png'}")

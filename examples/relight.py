@@ -12,6 +12,7 @@ import logging
 import os
 import statistics
 import time
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -259,7 +260,9 @@ def write_gif(pictures, path: Path) -> None:
         Image.fromarray(to_bytes(picture)).quantize(128, dither=Image.Dither.NONE)
         for picture in pictures
     )
-    first.save(path, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
+    buffer = BytesIO()
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
+    write_whole(path, buffer.getvalue())
 
 
 def write_sheet(pictures, records, path: Path) -> None:
@@ -274,7 +277,9 @@ def write_sheet(pictures, records, path: Path) -> None:
             f"{record['kind']}: {record['milliseconds']:.0f} ms, {record['psnr']:.0f} dB",
             fontsize=9,
         )
-    figure.savefig(path, dpi=100)
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=100)
+    write_whole(path, buffer.getvalue())
     plt.close(figure)
 
 

@@ -1,4 +1,4 @@
-"""Every array and every number of the public face: wrong kinds are named, others are read.
+"""Every public array and number: wrong types raise errors with the name, others are accepted.
 
 Functions are found by their entry in `CALLS`, a good call; `test_no_function_is_forgotten` asks
 for one of each. A kind is tried on every argument: on those that arrays are read of, all of
@@ -70,7 +70,7 @@ MOVING = shadow.MovingShadow(
 
 
 def _moving_shadow(**arguments):
-    """Made below jaxtyping's check: a class' own is about its `__init__`."""
+    """An instance made without jaxtyping's check of `__init__`."""
     made = object.__new__(type("Bare", (), {}))
     inspect.unwrap(shadow.MovingShadow.__init__)(made, **arguments)
     return [made.occluders, made.receivers]
@@ -81,7 +81,7 @@ PAIR = {"images": [IMAGE], "depths": [DEPTH], "cameras": [CAMERA], "target": CAM
 BLUR = {"image": IMAGE, "depth": DEPTH, "lens": LENS, "max_coc": 4.0}
 SHADOWED = {"shadow_map": MAP, "receivers": SEEN, "bias": 0.1, "slope_bias": 0.1}
 
-# A good call of each: its arguments by name.
+# Valid arguments of each function, by name.
 CALLS = {
     "blur.gaussian": (blur.gaussian, {"image": IMAGE, "taps": 3, "passes": 1, "sigma": 0.7}),
     "blur.downsample": (blur.downsample, {"image": IMAGE, "taps": 2}),
@@ -327,7 +327,7 @@ CALLS = {
     "Transfer": (Transfer, dict(vars(TRANSFER))),
 }
 
-# What is read by other names in the error, since it is the entry of another call.
+# Static arguments. Errors may name one differently, as it is passed to another function.
 STATIC = {
     *("taps", "passes", "row", "samples", "seed", "max_steps", "count", "map_size", "margin"),
     *("size", "dilation", "stride", "rounds", "slices", "height", "width", "i"),
@@ -338,7 +338,7 @@ TRACED = {("FocusPlanes", "max_coc")}
 
 
 def _bare(function):
-    """The function below jaxtyping's check of its arguments."""
+    """The function without jaxtyping's check of its arguments."""
     if isinstance(function, ft.partial):
         return ft.partial(_bare(function.func), *function.args, **function.keywords)
     if inspect.ismethod(function):  # a class'
@@ -393,7 +393,7 @@ def test_what_is_no_array_is_named(name, argument):
     for kind, make in WRONG.items():
         if kind == "None" and argument in MAY_BE_NONE:
             continue
-        # In `depth` what is masked is missing, and an image may be left out.
+        # In `depth`, masked pixels are missing, and an image is optional.
         may_be = kind == "masked" or (kind, argument) == ("None", "image")
         if name.startswith("depth.") and may_be:
             continue
@@ -405,7 +405,7 @@ def test_what_is_no_array_is_named(name, argument):
         assert "jaxtyping" not in type(caught.value).__module__
 
 
-# The others measure and search: they give their arguments to the effects.
+# Functions that measure or search pass their arguments on to the effects.
 # A fit or a plan compiles its programs at every call.
 SLOW = ("fit.", "budget.")
 
@@ -415,7 +415,7 @@ DETERMINED = [each for each in ARRAYS if not each[0].startswith(SLOW)]
 @pytest.mark.parametrize(("name", "argument"), DETERMINED)
 @pytest.mark.full
 def test_byte_orders_and_lists_are_read(name, argument):
-    """What holds the same numbers gives the same, to the last digit."""
+    """Arguments that hold the same numbers give equal results, to the last bit."""
     function, arguments = CALLS[name]
     value = np.asarray(arguments[argument])
     expected = jax.tree.leaves(_bare(function)(**arguments))
@@ -517,7 +517,7 @@ def test_check_camera_and_check_light():
 
 
 def test_no_function_is_forgotten():
-    """Every public function of arrays, and every type of ours, has its good call."""
+    """Every public function of arrays, and every class, has valid arguments in `CALLS`."""
     host = {"scene", "exr", "io", "tradeoff"}
     records = {"Plan", "Accumulation", "Choice", "Synthesis", "Hit", "Receivers", "Candidates"}
     records |= {"Lens", "Filled", "Projection", "Rays"}

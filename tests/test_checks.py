@@ -1,4 +1,4 @@
-"""Arguments: what is read as an array or a number, and what is refused, by name."""
+"""Arguments: what becomes an array or a number, and what raises an error with the name."""
 
 import inspect
 
@@ -34,7 +34,7 @@ def test_arrays_of_any_byte_order_keep_their_numbers_and_type(kind):
     assert isinstance(read, jax.Array)
     assert read.dtype == given.dtype.newbyteorder("=")
     np.testing.assert_array_equal(read, given)
-    # A view in another order, as a file's rows upside down, is no other array.
+    # A view with other strides, such as rows in reverse, is accepted.
     np.testing.assert_array_equal(_checks.as_array("f(x)", given[:, ::-1]), given[:, ::-1])
 
 

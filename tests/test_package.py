@@ -1,4 +1,4 @@
-"""The package as a whole: what importing it loads, what it lists, what its metadata say."""
+"""The package as a whole: what its import loads, what it lists, and its metadata."""
 
 import importlib.metadata
 import pkgutil
@@ -16,7 +16,7 @@ ROOT = Path(jaxfx.__file__).parent
 PUBLIC_MODULES = {
     module.name for module in pkgutil.iter_modules(jaxfx.__path__) if module.name[0] != "_"
 }
-# Modules that hold the types alone: their names are those of `jaxfx` itself.
+# Modules of types, whose names `jaxfx` itself exports.
 TYPES = {"camera", "gbuffer", "lens", "light"}
 
 

@@ -1,1 +1,1 @@
-"""The same sums in native code: parallel loops, compiled by numba."""
+"""The same computations in native code: parallel loops in numba, and CUDA."""

@@ -1,13 +1,13 @@
-"""Native peers on a GPU: scatter's sums, their adjoint, a shadow filter, a walk of a pyramid.
+"""Native peers on a GPU: scatter's sums, their adjoint, a shadow filter, a pyramid traversal.
 
-CUDA as one would write it by hand, by way of CuPy where that is installed. Arrays are
-contiguous float32; pictures are planes.
+Hand-written CUDA, launched by CuPy where that is installed. Arrays are contiguous float32; an
+image is stored plane by plane.
 """
 
 import numpy as np
 
 
-# Threads of a block, across and down.
+# Threads per block, along x and y.
 BLOCK = (32, 8)
 
 SOURCE = r"""
@@ -17,7 +17,7 @@ SOURCE = r"""
 __device__ float clamp01(float x) { return fminf(fmaxf(x, 0.0f), 1.0f); }
 __device__ float inside01(float x) { return x >= 0.0f && x < 1.0f ? 1.0f : 0.0f; }
 
-// The mean half-width of a disc in a row from its middle, and its slope in the radius.
+// The mean half-width of a disc within a row of pixels, and its derivative in the radius.
 __device__ float half_width(float r, int row, float* slope) {
     float a = fminf(fmaxf(row - 0.5f, -r), r), b = fminf(fmaxf(row + 0.5f, -r), r);
     float ca = sqrtf((r - a) * (r + a)), cb = sqrtf((r - b) * (r + b));
@@ -33,7 +33,7 @@ __device__ float cover_of(float width, int column, float* slope) {
     return clamp01(passed);
 }
 
-// Rows of sprites about a block, one offset of rows after the other, through shared memory.
+// The sources around a block are loaded to shared memory one row at a time.
 #define FOR_ROWS(...)                                                                    \
     const int x = blockIdx.x * WIDE + threadIdx.x, y = blockIdx.y * TALL + threadIdx.y;  \
     const int here = y * width + x, size = height * width, span = WIDE + 2 * reach;      \
@@ -42,7 +42,7 @@ __device__ float cover_of(float width, int column, float* slope) {
     float* line = shared + threadIdx.y * span * PLANES;                                  \
     __VA_ARGS__
 
-// The sources of a row: value, leak, and half-width, negative outside of the picture.
+// Loads a row of sources: value, leak, and half-width, which is negative outside the image.
 #define LOAD_SOURCES(row)                                                                \
     for (int k = threadIdx.x; k < span; k += WIDE) {                                     \
         int sx = blockIdx.x * WIDE + k - reach, sy = y + row, s = sy * width + sx;       \
@@ -74,7 +74,7 @@ extern "C" __global__ void scatter(
     #undef PLANES
 }
 
-// What the sums pass back to a source: to its value, its radius and its leak.
+// Adjoint of the sums with respect to each source's value, radius and leak.
 extern "C" __global__ void adjoint_source(
     float* value_bar, float* radius_bar, float* leak_bar, const float* value,
     const float* radius, const float* leak, const float* coc, const float* bar,
@@ -114,7 +114,7 @@ extern "C" __global__ void adjoint_source(
     #undef PLANES
 }
 
-// And to the circle of confusion of the pixel that they are the sums of.
+// Adjoint of the sums with respect to the target's circle of confusion.
 extern "C" __global__ void adjoint_target(
     float* coc_bar, const float* value, const float* radius, const float* leak,
     const float* coc, const float* bar, int height, int width, int reach
@@ -158,7 +158,7 @@ __device__ int held(float place, int node, int level) {
     return min(max((int)floorf(place), node << level), ((node + 1) << level) - 1);
 }
 
-// A walk down and up a minimum pyramid; -1 for a ray that meets nothing.
+// Traversal of a minimum pyramid: the time of each ray's hit, -1 for a miss.
 extern "C" __global__ void walk(
     float* times, const float* values, const int* offsets, const int* columns,
     const float* origins, const float* directions, int levels, int height, int width, int rays
@@ -202,7 +202,7 @@ extern "C" __global__ void walk(
 }
 """
 
-# Of each kernel, how many planes of its block's surroundings it holds in shared memory.
+# The planes that each kernel keeps in shared memory.
 SHARED = {"scatter": 6, "adjoint_source": 5, "adjoint_target": 6, "pcf": 0, "walk": 0}
 
 
@@ -212,7 +212,7 @@ def cupy():
         import cupy
 
         cupy.cuda.runtime.getDeviceCount()
-    except Exception:  # whatever is missing: the package, a driver, a device
+    except Exception:  # The package, a driver or a device is missing.
         return None
     return cupy
 
@@ -224,12 +224,12 @@ def launch(module, name, grid, arguments, reach=0):
 
 
 def grid_of(height, width):
-    """The blocks of a picture."""
+    """The number of blocks that cover an image, along x and y."""
     return -(-width // BLOCK[0]), -(-height // BLOCK[1])
 
 
 def sums(cupy, module, planes, reach, bar=None):
-    """A function that starts scatter's sums or, given `bar`, their adjoint; and what they fill.
+    """A function that launches scatter's sums or, given `bar`, their adjoint; and the outputs.
 
     `planes` are `value`, `radius`, `leak` and `coc`, on the device.
     """
@@ -241,8 +241,8 @@ def sums(cupy, module, planes, reach, bar=None):
     out = tuple(map(cupy.empty_like, planes))
 
     def adjoint():
-        given = (*planes, bar, *sizes)
-        launch(module, "adjoint_source", grid, (*out[:3], *given), reach)
-        launch(module, "adjoint_target", grid, (out[3], *given), reach)
+        inputs = (*planes, bar, *sizes)
+        launch(module, "adjoint_source", grid, (*out[:3], *inputs), reach)
+        launch(module, "adjoint_target", grid, (out[3], *inputs), reach)
 
     return adjoint, out

@@ -1,4 +1,4 @@
-"""The native peer: a walk down and up a minimum pyramid, one ray after another, by numba."""
+"""Native peer of reprojection: traversal of a minimum pyramid, ray by ray, in numba."""
 
 import math
 
@@ -8,16 +8,16 @@ import numpy as np
 
 @numba.njit(inline="always")
 def _held(place, node, level):
-    """A column or row held to a node's."""
+    """A coordinate as a column or row, clamped to a cell of a level."""
     return min(max(math.floor(place), node << level), ((node + 1) << level) - 1)
 
 
 @numba.njit(parallel=True, cache=True)
 def _walk(values, offsets, columns, size, thickness, origins, directions, times, steps):
-    """Each ray alone, in scalar code, as one would write it in C. Rays start inside.
+    """Fills the time of each ray's hit and its steps, in scalar code as in C.
 
-    They begin and change levels as ours do: the steps are the same, and what is compared is how
-    long they take.
+    Rays start inside the image. Start and changes of level are those of `reproject.intersect`:
+    both take the same steps, so that only the time per step is compared.
     """
     never = np.float32(np.inf)
     one, top = np.float32(1), len(offsets) - 1
@@ -51,8 +51,8 @@ def _walk(values, offsets, columns, size, thickness, origins, directions, times,
                     y = _held(oy + time * dy, node_y, level)
                 level = max(level - 2, 0)
                 if count == 1 and dz > 0:
-                    way = thickness / dz * max(abs(dx), abs(dy))
-                    level = min(level, math.ceil(math.log2(max(way / 4, 1))))
+                    span = thickness / dz * max(abs(dx), abs(dy))
+                    level = min(level, math.ceil(math.log2(max(span / 4, 1))))
                 continue
             if leave == never:
                 break

@@ -1,4 +1,4 @@
-"""The native peer: scatter depth of field as one would write it in C, by numba."""
+"""Native peer of depth of field: scatter as one would write it in C, in numba."""
 
 import math
 
@@ -8,7 +8,7 @@ import numpy as np
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def _scatter(image, radius, coc, foreground, visibility, epsilon, bands):
-    """Sprites with a linear edge; every thread owns a band of output rows."""
+    """Sums of sprites with a linear edge; every thread writes its own band of rows."""
     height, width, _ = image.shape
     half, one, zero = np.float32(0.5), np.float32(1), np.float32(0)
     per_epsilon = one / epsilon
@@ -47,7 +47,7 @@ def _scatter(image, radius, coc, foreground, visibility, epsilon, bands):
 
 
 def scatter(image, depth, lens, gamma, epsilon):
-    """What `jaxfx.dof.scatter` computes, with the sprite's edge a linear ramp."""
+    """As `jaxfx.dof.scatter`, with a linear ramp as the sprites' edge."""
     aperture, focus, focal = map(float, (lens.aperture, lens.focus_distance, lens.focal_pixels))
     depth = depth.astype(np.float32)
     coc = np.float32(aperture * focal) * np.abs(np.float32(1 / focus) - 1 / depth)

@@ -1,4 +1,4 @@
-"""The native peer: a full percentage-closer filter, one receiver after another, by numba."""
+"""Native peer of shadows: percentage-closer filtering of every receiver, in numba."""
 
 import math
 
@@ -8,7 +8,7 @@ import numpy as np
 
 @numba.njit(parallel=True, cache=True)
 def _count(shadow_map, u, v, threshold, size, lit):
-    """Each receiver alone, in scalar code, as one would write it in C."""
+    """Fills the visibility of each receiver, in scalar code as in C."""
     rows, columns = shadow_map.shape
     half = size // 2
     for j in numba.prange(u.shape[0]):
@@ -23,7 +23,7 @@ def _count(shadow_map, u, v, threshold, size, lit):
 
 
 def pcf(shadow_map, receivers, size, bias):
-    """The share of `size` x `size` texels that do not shadow; all lie before the light."""
+    """Visibility by `size` x `size` texels, of receivers that lie before the light."""
     u, v, z, _ = receivers
     lit = np.empty(u.shape, np.float32)
     _count(shadow_map, u, v, z - np.float32(bias), size, lit)

@@ -1,4 +1,4 @@
-"""The picture that the ratios are about: two discs before a wall."""
+"""The image on which depth of field is timed against native code: two discs before a wall."""
 
 import numpy as np
 
@@ -6,7 +6,10 @@ from jaxfx import ThinLens
 
 
 def two_discs(side, radius):
-    """A disc before the focus, blurred by the given radius, one in focus, a wall behind."""
+    """Image, depth and lens: a disc before the focus plane, one in it, and a wall behind.
+
+    `radius`, in pixels, is that of the nearer disc's circle of confusion.
+    """
     rng = np.random.default_rng(0)
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     image = rng.random((side, side, 3))

@@ -1,4 +1,4 @@
-"""Scenes of depth of field whose truth is known, and every method as a program for them."""
+"""Scenes of depth of field with known results, and every method compiled for them."""
 
 import functools as ft
 import inspect
@@ -12,10 +12,11 @@ import numpy as np
 from jaxfx import PinholeCamera, ThinLens, dof
 
 
-# The blurred halves have a radius a little below the largest, where a circle would be clamped.
+# Side of the image, radius of the blurred halves, and `max_coc`, all in pixels. The radius is a
+# little smaller than half of `max_coc`, at which circles are clamped.
 SIZE, RADIUS, MAX_COC = 46, 5.9, 12.0
 MIDDLE = SIZE // 2
-# Signed distance of the pixels of a row from the middle of the picture, where edges are.
+# Signed distance of a row's pixels from the middle of the image, where edges are.
 COLUMNS = np.arange(SIZE) + 0.5 - MIDDLE
 
 
@@ -32,8 +33,8 @@ def methods() -> dict[str, Callable[..., Any]]:
 
 METHODS = tuple(methods())
 
-# The settings that are charted beside a method's default. Words are static, numbers are
-# traced, so that all of these share one program.
+# The settings that are charted beside a method's default. Strings are static; numbers are
+# traced, so that settings which differ in numbers only share one program.
 SETTINGS: dict[str, dict[str, Any]] = {
     "scatter, gamma 1": {"gamma": 1.0},
     "scatter, gamma 3": {"gamma": 3.0},
@@ -52,10 +53,10 @@ def _program(name: str, *static: tuple[str, str]) -> Callable[..., Any]:
 
 
 def blurred(method: str) -> Callable[..., Any]:
-    """The program of a method or of a setting of `scatter`: of image, depth and lens."""
-    name, given = method.partition(",")[0], SETTINGS.get(method, {})
-    static = {key: value for key, value in given.items() if isinstance(value, str)}
-    traced = {key: value for key, value in given.items() if key not in static}
+    """The compiled function of image, depth and lens, of a method or one of `SETTINGS`."""
+    name, options = method.partition(",")[0], SETTINGS.get(method, {})
+    static = {key: value for key, value in options.items() if isinstance(value, str)}
+    traced = {key: value for key, value in options.items() if key not in static}
     if name == "scatter":
         traced = {"gamma": 0.0, "epsilon": 2.0} | traced
     return ft.partial(_program(name, *static.items()), **traced)
@@ -63,7 +64,10 @@ def blurred(method: str) -> Callable[..., Any]:
 
 @ft.cache
 def _derivative(name: str) -> Callable[..., Any]:
-    """Of image, depth, lens, and a direction in depth, aperture and focus. Quick to compile."""
+    """The directional derivative of a method, compiled with little optimisation.
+
+    It is a function of image, depth, lens, and a direction in depth, aperture and focus.
+    """
 
     def push(image, depth, lens, along, options):
         def seen(depth, aperture, focus):
@@ -77,7 +81,7 @@ def _derivative(name: str) -> Callable[..., Any]:
 
 
 def derivative(method: str, image: Any, depth: Any, lens: ThinLens, along: Any) -> np.ndarray:
-    """What a method says its picture changes by."""
+    """The directional derivative of a method's image, as the method computes it."""
     run = blurred(method)
     return np.asarray(
         _derivative(method.partition(",")[0])(image, depth, lens, along, run.keywords)
@@ -85,7 +89,7 @@ def derivative(method: str, image: Any, depth: Any, lens: ThinLens, along: Any) 
 
 
 def directions(depth: Any, seed: int = 1) -> list[tuple[Any, Any, Any]]:
-    """Along the aperture, the focus, and some of the depths that are finite."""
+    """Directions along the aperture, along the focus, and in all finite depths at random."""
     random = np.random.default_rng(seed).normal(size=np.shape(depth))
     move = jnp.where(jnp.isfinite(depth), 0.1 * random, 0.0)
     zero, one = jnp.zeros(()), jnp.ones(())
@@ -93,33 +97,37 @@ def directions(depth: Any, seed: int = 1) -> list[tuple[Any, Any, Any]]:
 
 
 def off_quotients(method: str, image: Any, depth: Any, lens: ThinLens) -> dict[str, float]:
-    """How far derivatives lie outside the two one-sided difference quotients.
+    """How far derivatives lie outside the interval of the two one-sided difference quotients.
 
-    In the aperture, the focus and the depth, over the largest derivative (1e-3 at the least);
-    and how many are not finite.
+    It is the worst over aperture, focus and depth, relative to the largest derivative (1e-3 at
+    least). Then how many derivatives are not finite.
     """
-    picture, step, worst, wrong = blurred(method), 1e-6, 0.0, 0
-    value = np.asarray(picture(image, depth, lens))
+    run, step, worst, not_finite = blurred(method), 1e-6, 0.0, 0
+    value = np.asarray(run(image, depth, lens))
     for along in directions(depth):
         slope = derivative(method, image, depth, lens, along)
         at = (jnp.asarray(depth), lens.aperture, lens.focus_distance)
 
         def moved(by, at=at, along=along):
             place, aperture, focus = (x + by * d for x, d in zip(at, along, strict=True))
-            return np.asarray(
-                picture(image, place, ThinLens(aperture, focus, lens.focal_pixels))
-            )
+            return np.asarray(run(image, place, ThinLens(aperture, focus, lens.focal_pixels)))
 
         before, after = (value - moved(-step)) / step, (moved(step) - value) / step
         nearest = np.clip(slope, np.minimum(before, after), np.maximum(before, after))
         largest = max(float(np.abs(slope).max()), 1e-3)
         worst = max(worst, float(np.abs(slope - nearest).max()) / largest)
-        wrong += int((~np.isfinite(slope)).sum())
-    return {"gradient": worst, "not finite": float(wrong)}
+        not_finite += int((~np.isfinite(slope)).sum())
+    return {"gradient": worst, "not finite": float(not_finite)}
 
 
 class Scene(NamedTuple):
-    """What a ray meets; the lens; what it would see, of its aperture; the pixels that count."""
+    """A scene with the exact image through a lens.
+
+    - `cast`: colour and depth that rays, by origin and direction, meet.
+    - `lens`: the lens.
+    - `seen`: a row of the exact image, as a function of a factor of the aperture.
+    - `counted`: the pixels of the row that are scored.
+    """
 
     cast: Callable[[Any, Any], tuple[Any, Any]]
     lens: ThinLens
@@ -128,7 +136,7 @@ class Scene(NamedTuple):
 
     @property
     def truth(self) -> np.ndarray:
-        """The row of the picture that the lens would see."""
+        """A row of the exact image."""
         return self.seen(1.0)
 
     @property
@@ -145,7 +153,7 @@ class Scene(NamedTuple):
         return color[..., None], depth
 
     def accumulated(self, samples: int = 256) -> Any:
-        """The multi-pass reference of the scene itself."""
+        """The multi-pass reference."""
         render = jax.jit(lambda camera: self.through(camera)[0])
         options = {"samples": samples, "jitter": False, "progress": False}
         return dof.accumulate(render, CAMERA, self.lens, **options).image
@@ -155,7 +163,7 @@ CAMERA = PinholeCamera(np.array([[SIZE, 0, MIDDLE], [0, SIZE, MIDDLE], [0, 0, 1.
 
 
 def covered(distance: np.ndarray, radius: float) -> np.ndarray:
-    """The share of a disc on the far side of a line at a distance from its centre."""
+    """The fraction of a disc beyond a line at a signed distance from its centre."""
     s = np.clip(distance / radius, -1, 1)
     return 0.5 - (s * np.sqrt(1 - s * s) + np.arcsin(s)) / np.pi
 
@@ -165,7 +173,7 @@ def _lens(focus: float, coc: float, depth: float) -> ThinLens:
 
 
 def edge(focus: float, seen: Callable[[float], np.ndarray]) -> Scene:
-    """A white half-plane at depth 1, on the left, before a black one at 2."""
+    """A white half-plane at depth 1, on the left, before a black plane at depth 2."""
 
     def cast(origin, direction):
         x = origin[0] + (1 - origin[2]) * direction[..., 0]
@@ -176,7 +184,7 @@ def edge(focus: float, seen: Callable[[float], np.ndarray]) -> Scene:
 
 
 def bar(width: int) -> Scene:
-    """A dim bar in focus, some pixels wide, before a bright field infinitely far away."""
+    """A dim bar in focus, `width` pixels wide, before a bright background at infinity."""
 
     def cast(origin, direction):
         x = SIZE * (origin[0] + (1 - origin[2]) * direction[..., 0])
@@ -190,17 +198,17 @@ def bar(width: int) -> Scene:
 
 
 def slanted() -> Scene:
-    """An opaque plane through focus, blurred by 10 pixels at both ends, of linear colour."""
+    """A slanted plane through the focus plane, blurred by 10 pixels at both ends."""
 
     def cast(origin, direction):
-        # 1 / depth = 1/2 - (x - middle) / (4 middle) in the picture of the lens' centre.
+        # 1 / depth = 1/2 - (x - middle) / (4 middle) in the pinhole image.
         normal = jnp.array([-0.5, 0.0, 0.5])
         hit = (1 - jnp.vdot(normal, origin)) / jnp.sum(normal[None, None] * direction, axis=-1)
         point = origin[None, None] + hit[..., None] * direction
         return 0.5 + point[..., 0] / point[..., 2], point[..., 2]
 
-    # A point x from the middle is seen at x (1 + a s), s being its place on the lens from -1 to
-    # 1; the mean of 1 / (1 + a s) over a disc is this.
+    # A point at x from the middle is seen at x (1 + a s) from the lens position s in [-1, 1].
+    # The formula is the mean of 1 / (1 + a s) over the disc of the lens.
     def seen(scale):
         a = 5 * scale / MIDDLE
         return 0.5 + 2 * (1 - np.sqrt(1 - a * a)) / (a * a) * COLUMNS / SIZE
@@ -210,7 +218,7 @@ def slanted() -> Scene:
 
 @ft.cache
 def scenes() -> dict[str, list[Scene]]:
-    """The cases with a picture to look at, by name."""
+    """The cases that have an image, by name."""
     return {
         "slanted plane": [slanted()],
         "blurred foreground": [edge(2.0, lambda scale: covered(COLUMNS, RADIUS * scale))],
@@ -224,7 +232,7 @@ LENS = ThinLens(0.25, 2.5, 60.0)
 
 @ft.cache
 def random_picture() -> tuple[np.ndarray, np.ndarray]:
-    """A picture, and depths of which some are infinite, in focus or next to the lens."""
+    """A random image, and depths of which some are infinite, in focus or next to the lens."""
     rng = np.random.default_rng(0)
     depth = rng.uniform(1.0, 8.0, (SIZE, SIZE))
     special = rng.choice([0.01, 2.5, np.inf, np.nan], (SIZE, SIZE), p=[0.01, 0.1, 0.1, 0.79])
@@ -233,6 +241,7 @@ def random_picture() -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_float32(*arrays: np.ndarray) -> list[Any]:
+    """The arrays in float32."""
     return [jnp.asarray(array, jnp.float32) for array in arrays]
 
 

@@ -1,4 +1,4 @@
-"""The still life under many lights, and the picture of it rendered anew."""
+"""The still life under many lights, and its image rendered from the mesh for every edit."""
 
 import functools
 
@@ -12,30 +12,32 @@ from jaxfx.scene.embree import accelerated
 
 @functools.cache
 def view(size):
+    """The mesh and its default camera."""
     mesh = scene.still_life()
     return mesh, scene.default_camera(mesh, height=size[0], width=size[1])
 
 
 @functools.cache
 def cache(size):
+    """The mesh's G-buffer and its camera."""
     mesh, camera = view(size)
     return scene.gbuffer(mesh, camera, height=size[0], width=size[1]), camera
 
 
 def lights(count, seed=0):
-    """White point lights above the still life, which together are as bright as one."""
+    """`count` white point lights above the still life, of one total intensity for any count."""
     rng = np.random.default_rng(seed)
     low, high = view((48, 64))[0].bounds
     middle = (low + high) / 2
-    where = rng.uniform(-0.4, 0.4, (count, 3)) * (high - low) + middle
-    where[:, 1] = high[1] - rng.uniform(0.1, 0.3, count) * (high[1] - low[1])
+    positions = rng.uniform(-0.4, 0.4, (count, 3)) * (high - low) + middle
+    positions[:, 1] = high[1] - rng.uniform(0.1, 0.3, count) * (high[1] - low[1])
     color = np.full(3, 12 / count, np.float32)
-    return [PointLight(position.astype(np.float32), color) for position in where]
+    return [PointLight(position.astype(np.float32), color) for position in positions]
 
 
 @functools.cache
 def new_view(size, count):
-    """A camera, its depth, and the caches about it with their cameras."""
+    """A new camera, its depth, and `count` caches around it with their cameras."""
     mesh, _ = view(size)
     look = mesh.viewpoint
     offsets = np.array(
@@ -59,7 +61,7 @@ def new_view(size, count):
 
 
 def shadow_starts(mesh, gbuffer, camera):
-    """Where each pixel's shadow rays start, in the unit ball that Embree has the mesh in."""
+    """The origins of the pixels' shadow rays, in the coordinates of `Scene.unit_triangles`."""
     depth = gbuffer.depth
     height, width = depth.shape
     points = camera.unproject(pixel_centers(height, width, depth.dtype), depth)
@@ -68,7 +70,7 @@ def shadow_starts(mesh, gbuffer, camera):
 
 
 def unshadowed(mesh, start, light):
-    """1 where nothing stands between a start and a point light, by one ray for each."""
+    """Whether nothing lies between each origin and a point light, by one ray each."""
     end = (np.asarray(light.position) - mesh.center) / mesh.radius
     reach = np.ones(len(start), np.float32)
     hit = accelerated(mesh).run(
@@ -78,7 +80,7 @@ def unshadowed(mesh, start, light):
 
 
 def rendered_anew(mesh, camera, lights, size):
-    """The picture with shadows, from the mesh: nothing is kept."""
+    """The image with traced shadows, rendered from the mesh: nothing is reused."""
     gbuffer = scene.gbuffer(mesh, camera, height=size[0], width=size[1], backend="embree")
     start = shadow_starts(mesh, gbuffer, camera)
     image = jnp.zeros((*size, 3), jnp.float32)

@@ -1,8 +1,7 @@
-"""Relighting's truth: what Mitsuba, a path tracer, says of the same meshes and lights.
+"""Reference images for relighting, by Mitsuba, a path tracer, of the same meshes and lights.
 
-Every surface is Lambert there. Mitsuba traces one ray through each pixel's centre, so that its
-picture is antialiased no more than a cache is. Its radiance is 1 / pi of this package's
-picture of the same light.
+Every surface is Lambert. Mitsuba traces one ray through each pixel's centre, so that its image
+is not antialiased, like a G-buffer. Its radiance is 1 / pi of this package's under one light.
 """
 
 import functools
@@ -19,7 +18,7 @@ from jaxfx.io import linear_from_srgb
 
 mi.set_variant("scalar_rgb")
 
-# A spot light's border has another shape in Mitsuba: this one has next to none.
+# The border of a spot light has another profile in Mitsuba: this one is very narrow.
 LIGHTS = {
     "directional": DirectionalLight([0.5, -0.9, -0.6], [1.0, 0.9, 0.8]),
     "point": PointLight([0.5, 1.4, -1.5], [2.0, 1.8, 1.5]),
@@ -28,41 +27,41 @@ LIGHTS = {
 
 
 def lambert(mesh, camera, size):
-    """The cache, every surface of it Lambert."""
-    found = scene.gbuffer(mesh, camera, height=size[0], width=size[1], backend="embree")
-    shader = jnp.where(found.shader < 0, -1, 0)
-    return eqx.tree_at(lambda gbuffer: gbuffer.shader, found, shader)
+    """The mesh's G-buffer, with every surface Lambert."""
+    gbuffer = scene.gbuffer(mesh, camera, height=size[0], width=size[1], backend="embree")
+    shader = jnp.where(gbuffer.shader < 0, -1, 0)
+    return eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
 
 
 def shadow_of(mesh, gbuffer, camera, light, map_size=1024):
-    """The light's visibility by shadow maps, unfiltered."""
+    """The light's visibility by unfiltered shadow maps."""
     ball = {"center": mesh.center, "radius": mesh.radius}
     cameras = shadow.light_cameras(light, map_size=map_size, **ball)
     take = functools.partial(scene.depth, mesh, height=map_size, width=map_size)
-    maps = [take(each, backend="embree") for each in cameras]
+    maps = [take(light_camera, backend="embree") for light_camera in cameras]
     cameras = cameras if len(cameras) > 1 else cameras[0]
-    seen = shadow.receivers(gbuffer.depth, camera, cameras, normal=gbuffer.normal)
-    return shadow.hard(jnp.concatenate(maps, axis=1), seen, bias=2e-3, slope_bias=1.0)
+    receivers = shadow.receivers(gbuffer.depth, camera, cameras, normal=gbuffer.normal)
+    return shadow.hard(jnp.concatenate(maps, axis=1), receivers, bias=2e-3, slope_bias=1.0)
 
 
 def unshadowed(mesh, position, light):
-    """1 where nothing stands between a point and the light, else 0."""
+    """1 where nothing lies between a point and the light, else 0."""
     if isinstance(light, DirectionalLight):
-        way = np.asarray(light.direction, float)
-        end = np.asarray(position) - 4 * mesh.radius * way / np.linalg.norm(way)
+        direction = np.asarray(light.direction, float)
+        end = np.asarray(position) - 4 * mesh.radius * direction / np.linalg.norm(direction)
     else:
         end = np.asarray(light.position, float)
     return np.asarray(scene.visible(mesh, position, end), np.float32)
 
 
 def emitter(light):
-    """The light in Mitsuba's words."""
+    """The light as a dictionary for Mitsuba."""
     rgb = lambda color: {"type": "rgb", "value": np.asarray(color, float).tolist()}
     if isinstance(light, DirectionalLight):
-        way = np.asarray(light.direction, float)
+        direction = np.asarray(light.direction, float)
         return {
             "type": "directional",
-            "direction": (way / np.linalg.norm(way)).tolist(),
+            "direction": (direction / np.linalg.norm(direction)).tolist(),
             "irradiance": rgb(light.color),
         }
     position = np.asarray(light.position, float)
@@ -86,7 +85,7 @@ def emitter(light):
 
 
 def _shape(mesh, material, index):
-    """The faces of one material as a Mitsuba mesh, each with corners of its own."""
+    """The faces of one material as a Mitsuba mesh whose faces share no vertices."""
     faces = np.flatnonzero(mesh.face_materials == index)
     count = 3 * len(faces)
     uv = mesh.uv[faces].reshape(-1, 2)
@@ -121,12 +120,13 @@ def _shape(mesh, material, index):
 
 
 def bare(material):
-    """The share of the base colour that is diffuse."""
+    """The fraction of the base colour that is diffuse."""
     return 1 - material.metallic
 
 
 @functools.cache
 def shapes(mesh):
+    """All of a mesh's faces as Mitsuba meshes, one per material."""
     return {
         f"shape{index}": _shape(mesh, material, index)
         for index, material in enumerate(mesh.materials)
@@ -138,14 +138,16 @@ def rays(camera, size):
     pixels = np.asarray(pixel_centers(*size), np.float64)
     pose = np.asarray(camera.world_from_camera, np.float64)
     inverse = np.linalg.inv(np.asarray(camera.intrinsics, np.float64))
-    way = np.concatenate([pixels, np.ones((*size, 1))], axis=-1) @ inverse.T @ pose[:3, :3].T
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    direction = (
+        np.concatenate([pixels, np.ones((*size, 1))], axis=-1) @ inverse.T @ pose[:3, :3].T
+    )
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     eye = pose[:3, 3].tolist()
-    return [mi.RayDifferential3f(mi.Ray3f(eye, each.tolist())) for each in way.reshape(-1, 3)]
+    return [mi.RayDifferential3f(mi.Ray3f(eye, d.tolist())) for d in direction.reshape(-1, 3)]
 
 
 def direct(mesh, camera, light, size, *, shadows):
-    """The picture under one light; without `shadows`, light passes through everything."""
+    """The image under one light; without `shadows`, nothing blocks it."""
     world = mi.load_dict({"type": "scene", **shapes(mesh), "light": emitter(light)})
     image = np.zeros((size[0] * size[1], 3))
     context = mi.BSDFContext()
@@ -158,7 +160,7 @@ def direct(mesh, camera, light, size, *, shadows):
 
 
 def bounced(mesh, camera, light, size, samples, *, seed=0):
-    """The light that meets one surface more before the one that is seen: its mean and noise."""
+    """The image of one bounce of indirect light, and its standard error, by path tracing."""
     world = mi.load_dict({"type": "scene", **shapes(mesh), "light": emitter(light)})
     path = lambda depth: mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
     once, twice = path(2), path(3)
@@ -166,9 +168,9 @@ def bounced(mesh, camera, light, size, samples, *, seed=0):
     sampler.seed(seed)
     image, noise = (np.zeros((size[0] * size[1], 3)) for _ in range(2))
     for pixel, ray in enumerate(rays(camera, size)):
-        straight = np.array(once.sample(world, sampler, ray)[0])
-        taken = [twice.sample(world, sampler, ray)[0] for _ in range(samples)]
-        taken = np.array(taken, float).reshape(samples, 3)
-        image[pixel] = taken.mean(axis=0) - straight
-        noise[pixel] = taken.std(axis=0) / np.sqrt(samples)
+        direct_light = np.array(once.sample(world, sampler, ray)[0])
+        paths = [twice.sample(world, sampler, ray)[0] for _ in range(samples)]
+        paths = np.array(paths, float).reshape(samples, 3)
+        image[pixel] = paths.mean(axis=0) - direct_light
+        noise[pixel] = paths.std(axis=0) / np.sqrt(samples)
     return np.pi * image.reshape(*size, 3), np.pi * noise.reshape(*size, 3)

@@ -1,4 +1,4 @@
-"""Where searches fail, and what reprojection is measured against: fields, peers and scores."""
+"""Depth maps on which searches fail; peers and scores to measure reprojection against."""
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,11 @@ from jaxfx._sampling import bilinear, pixel_centers
 from jaxfx.reproject import intersect
 
 
-# Fields of depth, and rays that slant over them, `slope` texels to each tenth of depth.
+# Depth maps, and rays across them that move `slope` texels per 0.1 of depth.
 
 
 def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
-    """A camera somewhere, turned about the vertical by so many radians."""
+    """A camera at a position, turned about the vertical axis by `turn`, in radians."""
     pose = np.eye(4)
     c, s = np.cos(turn), np.sin(turn)
     pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
@@ -22,6 +22,7 @@ def camera(height=24, width=32, at=(0.0, 0.0, 0.0), turn=0.0):
 
 
 def smooth(size):
+    """Smooth waves."""
     y, x = np.mgrid[:size, :size] / size
     return 0.6 + 0.1 * np.sin(9 * x) * np.cos(7 * y)
 
@@ -36,6 +37,7 @@ def posts(size):
 
 
 def cliff(size):
+    """One step in depth."""
     depth = np.full((size, size), 0.8)
     depth[:, size // 2 :] = 0.3
     return depth
@@ -45,6 +47,7 @@ FIELDS = {"smooth": smooth, "posts": posts, "cliff": cliff}
 
 
 def slanted_rays(size, slope):
+    """A ray per texel, all in one direction."""
     y, x = np.mgrid[:size, :size] + 0.5
     origin = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     direction = np.array([np.cos(0.4), np.sin(0.4), 0.1 / max(slope, 1e-9)])
@@ -54,11 +57,11 @@ def slanted_rays(size, slope):
     return origin - back * (1, 1, 0), np.broadcast_to(direction, origin.shape)
 
 
-# The page's rays: as many as texels, through all of the depth.
+# The rays that are timed: one per texel, through the whole range of depth.
 
 
 def hills(side):
-    """Smooth hills with forty discs before them."""
+    """Smooth hills behind forty discs."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:side, :side] / side
     depth = 0.6 + 0.15 * np.sin(9 * x + 3 * y) * np.cos(7 * y - x)
@@ -70,7 +73,7 @@ def hills(side):
 
 
 def fan(side, slant):
-    """A fan of rays that slant to one side and begin inside the image."""
+    """A fan of rays that slant to one side, by `slant` image sides, and begin in the image."""
     y, x = np.mgrid[:side, :side] + 0.5
     across = side * slant * np.array([np.cos(0.3), np.sin(0.3)])
     fan = 0.2 * (np.stack([x, y], axis=-1) - side / 2)
@@ -87,7 +90,7 @@ run = jax.jit(intersect, static_argnames=("search", "max_steps", "surface"))
 
 
 def error_rate(depth, slope, method, max_steps=None):
-    """The share of rays whose mask is wrong or whose hit is over a texel off."""
+    """The fraction of rays with a wrong mask, or a hit more than a texel off."""
     origin, direction = slanted_rays(len(depth), slope)
     exact = run(depth, origin, direction)
     hit = run(depth, origin, direction, search=method, max_steps=max_steps)
@@ -96,11 +99,11 @@ def error_rate(depth, slope, method, max_steps=None):
     return float(wrong.mean())
 
 
-# A view turned, its truth, and the two peers.
+# A turned view, its reference, and two peers.
 
 
 def orbit(eye, degrees, distance):
-    """The camera turned about a point on its axis."""
+    """The camera turned by `degrees` about the point at `distance` on its axis."""
     pose, a = np.asarray(eye.world_from_camera, float), np.deg2rad(degrees)
     pivot = pose[:3, 3] + distance * pose[:3, 2]
     turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
@@ -111,7 +114,7 @@ def orbit(eye, degrees, distance):
 
 
 def photographer(mesh, side):
-    """The mesh's own camera, and what takes its picture and its depth from any other."""
+    """The mesh's default camera, and a function from a camera to image and depth."""
     eye = scene.default_camera(mesh, height=side, width=side)
     lights = scene.default_lights(eye)
 
@@ -123,14 +126,14 @@ def photographer(mesh, side):
 
 
 def from_target(depth, source, target):
-    """Where the source sees the points of the target's depth, and how far from it they are."""
+    """The pixels and depths, in the source camera, of the points of the target's depth."""
     pixels = pixel_centers(*depth.shape, depth.dtype)
     points = target.unproject(pixels, jnp.where(depth < jnp.inf, depth, 1e6))
     return source.project(points)
 
 
 def backward_warp(image, target_depth, source, target):
-    """The cheap peer, which knows the target's depth: each point's colour, hidden or not."""
+    """A cheap peer that knows the target's depth: it ignores occlusion in the source."""
     pixels, z = from_target(target_depth, source, target)
     height, width, _ = image.shape
     limits = jnp.asarray([width, height], pixels.dtype)[None, None]
@@ -139,7 +142,7 @@ def backward_warp(image, target_depth, source, target):
 
 
 def visible(depth, source, target, target_depth):
-    """Which of the target's pixels the source saw too, from the true depth of both."""
+    """Which of the target's pixels are visible in the source, by the true depth of both."""
     pixels, z = map(np.asarray, from_target(jnp.asarray(target_depth), source, target))
     height, width = depth.shape
     inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=-1) & (z > 0)
@@ -148,7 +151,7 @@ def visible(depth, source, target, target_depth):
 
 
 def scores(drawn, alpha, truth, seen):
-    """PSNR of what is drawn and was seen; and the shares of pixels, of the whole picture."""
+    """PSNR of the pixels that are drawn and visible; wrong pixels as fractions of the image."""
     shown = np.asarray(alpha) > 0
     error = np.mean((np.asarray(drawn) - np.asarray(truth))[seen & shown] ** 2)
     return {
@@ -160,7 +163,7 @@ def scores(drawn, alpha, truth, seen):
 
 
 def depth_mesh(depth, source, threshold=0.1):
-    """The exact peer: Embree on two triangles a texel, none across a step in depth."""
+    """An exact peer: Embree with two triangles per four texels, none across a depth step."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -178,7 +181,7 @@ def depth_mesh(depth, source, threshold=0.1):
 
 
 def trace(mesh, image, source, target, shape):
-    """The picture of a traced depth mesh."""
+    """The target's image by ray tracing a `depth_mesh`, and where a ray hits."""
     pixels = pixel_centers(*shape, jnp.float32)
     start = np.asarray(target.unproject(pixels, jnp.zeros(shape, jnp.float32)))
     along = np.asarray(target.unproject(pixels, jnp.ones(shape, jnp.float32))) - start

@@ -1,4 +1,4 @@
-"""Random maps; scenes whose shadows are known: made so, traced by Embree, or of slabs."""
+"""Random shadow maps, and scenes with reference shadows: analytic, or traced by Embree."""
 
 from typing import Any
 
@@ -21,13 +21,13 @@ from jaxfx._sampling import pixel_centers
 
 WHITE = [1.0, 1.0, 1.0]
 
-# Two discs over a floor that is seen turned, a pixel 0.9 texels wide; smaller for larger
-# filters, so that 3 to 5 % of the pixels lie in a penumbra.
+# `two_discs`: the texels per pixel, in a view rotated against the map; the floor's depth. The
+# discs shrink for larger filters, so that 3 to 5 % of the pixels lie in a penumbra.
 STEP, FLOOR = 0.9, 5.0
 
 
 def steps(seed: int, dtype: Any = np.float32) -> tuple[np.ndarray, shadow.Receivers]:
-    """A map of a few flat depths with single texels among them: windows that agree exist."""
+    """A map of flat blocks and a few single texels, so that some filter windows are uniform."""
     rng = np.random.default_rng(seed)
     shadow_map = np.repeat(np.repeat(rng.choice([1.0, 2.0, np.inf], (4, 5)), 16, 0), 16, 1)
     shadow_map[rng.integers(0, 64, 5), rng.integers(0, 80, 5)] = rng.uniform(0.5, 3, 5)
@@ -43,7 +43,7 @@ def noise(
     shape: tuple[int, int] = (9, 11),
     dtype: Any = np.float64,
 ) -> tuple[np.ndarray, shadow.Receivers]:
-    """A map with holes, and receivers in it, about it, and behind the light."""
+    """A random map with background, and receivers inside, outside, and behind the light."""
     rng = np.random.default_rng(seed)
     shadow_map = rng.uniform(1, 3, map_shape)
     shadow_map[rng.uniform(size=map_shape) < 0.1] = np.inf
@@ -55,7 +55,7 @@ def noise(
 
 
 def two_discs(size, side=512):
-    """The map and the receivers: NumPy, float32."""
+    """A map of two discs above a floor, and the receivers' fields, in float32 NumPy."""
     y, x = np.mgrid[:side, :side] + 0.5
     shadow_map = np.full((side, side), FLOOR)
     for cx, cy, radius, depth in ((0.3, 0.35, 460, 2.0), (0.68, 0.62, 560, 3.0)):
@@ -68,7 +68,10 @@ def two_discs(size, side=512):
 
 
 def plate(magnification, width, side=96, texels=64):
-    """A floor at 4 below a plate of `width` texels at 2; a texel is so many pixels wide."""
+    """A plate of `width` texels at depth 2 above a floor at 4.
+
+    A texel is `magnification` pixels wide.
+    """
     shadow_map = np.full((texels, texels), 5.0)
     first = (texels - width) // 2
     shadow_map[:, first : first + width] = 2.0
@@ -78,7 +81,7 @@ def plate(magnification, width, side=96, texels=64):
 
 
 class Still:
-    """A view of the still life: its depth, normals and points, and rays from these."""
+    """A view of the still life: its depth, normals and points, and rays traced from these."""
 
     sun = np.array([0.6, -0.67, -0.42])
     lamp, target = np.array([-1.2, 2.6, -1.6]), np.array([0.0, 0.4, -3.8])
@@ -89,15 +92,15 @@ class Still:
 
         self.side, self.mesh = side, scene.still_life()
         self.eye = scene.default_camera(self.mesh, height=side, width=side)
-        found = scene.gbuffer(self.mesh, self.eye, height=side, width=side, backend="embree")
-        self.depth, self.normal = found.depth, found.normal
-        centers = pixel_centers(side, side, found.depth.dtype)
-        self.points = np.asarray(self.eye.unproject(centers, found.depth), np.float64)
+        gbuffer = scene.gbuffer(self.mesh, self.eye, height=side, width=side, backend="embree")
+        self.depth, self.normal = gbuffer.depth, gbuffer.normal
+        centers = pixel_centers(side, side, gbuffer.depth.dtype)
+        self.points = np.asarray(self.eye.unproject(centers, gbuffer.depth), np.float64)
         self.rays = EmbreeScene(robust=True)
         TriangleMesh(self.rays, self.mesh.vertices[self.mesh.faces].astype(np.float32))
 
     def truth(self, towards, distance=np.inf):
-        """Which points see the light, and which face it at more than a grazing angle."""
+        """Which points see the light in direction `towards`, and which face it clearly."""
         towards = np.broadcast_to(towards, self.points.shape)
         towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
         normal = np.asarray(self.normal, np.float64)
@@ -108,11 +111,12 @@ class Still:
         return clear, np.sum(normal * towards, axis=-1) > 0.05
 
     def from_position(self, position):
+        """As `truth`, for a light at a position."""
         towards = position - self.points
         return self.truth(towards, np.linalg.norm(towards, axis=-1))
 
     def compared(self, cameras, map_size):
-        """The maps side by side, and the receivers."""
+        """The cameras' shadow maps side by side, and the receivers."""
         options = {"height": map_size, "width": map_size, "backend": "embree"}
         maps = [np.asarray(scene.depth(self.mesh, camera, **options)) for camera in cameras]
         seen = shadow.receivers(self.depth, self.eye, cameras, normal=self.normal)
@@ -127,7 +131,7 @@ class Still:
         return self.compared(cameras, map_size)
 
     def under_a_square_lamp(self, map_size, light_size):
-        """The camera, what is compared, the share of 36 rays, and where that is a penumbra."""
+        """The lamp's camera, map and receivers, the visibility by 36 rays, and the penumbra."""
         light = SpotLight(self.lamp, self.target - self.lamp, WHITE, 0.7, 0.9)
         (camera,) = shadow.light_cameras(light, map_size=map_size)
         right, down = light_size * np.asarray(camera.world_from_camera, np.float64)[:3, :2].T
@@ -143,14 +147,15 @@ class Still:
 
 
 def acne_and_leaks(visible, clear, facing):
-    """The share of what is lit that is shown dark; of what is dark, shown lit."""
+    """The fraction of lit points that are shown dark, and of dark points that are shown lit."""
     visible = np.asarray(visible)
     return np.mean(visible[facing & clear] == 0), np.mean(visible[facing & ~clear] == 1)
 
 
 class Boxes:
-    """Boxes on a floor, seen straight from above: every visible face is level, and so equally
-    bright wherever the sun is. It is known by its shadow alone.
+    """Boxes on a floor, seen from above.
+
+    All visible faces are horizontal and so equally bright: only shadows tell where the sun is.
     """
 
     bounds = np.array(
@@ -163,7 +168,7 @@ class Boxes:
     )
     up = np.array([0.0, 1.0, 0.0])
     sun = np.array([0.6, -1.0, 0.35]) / np.linalg.norm([0.6, -1.0, 0.35])
-    # Texels a unit, in each round of a search; a surface blurs over one of them.
+    # Texels per scene unit in each round of a search; shadows are softened over one texel.
     scales = (8.0, 16.0, 32.0, 64.0)
 
     def __init__(self, side=64, map_size=160):
@@ -175,7 +180,7 @@ class Boxes:
         self.gbuffer = scene.gbuffer(self.mesh, self.eye, **self.size)
 
     def in_sun(self, direction):
-        """The pixels that no box hides from the sun, by slabs: 0 or 1."""
+        """The sun's visibility per pixel, 0 or 1, by the slab test against each box."""
         depth = jnp.asarray(self.gbuffer.depth, float)
         points = np.asarray(self.eye.unproject(pixel_centers(**self.size), depth))
         points = points + 1e-4 * self.up
@@ -187,19 +192,19 @@ class Boxes:
         return clear.astype(float)
 
     def photograph(self):
-        """Under a sun and a sky, with hard shadows."""
+        """The image under a sun and a sky, with hard shadows."""
         sky, sun = AmbientLight([0.2, 0.25, 0.3]), DirectionalLight(self.sun, [2.0, 1.8, 1.5])
         image = relight.shade(self.gbuffer, self.eye, sky)
         return image + relight.shade(self.gbuffer, self.eye, sun, self.in_sun(self.sun))
 
     def turned(self, angle, about):
-        """The sun's direction turned by an angle to one side."""
+        """The sun's direction rotated by `angle`, about an axis given by the angle `about`."""
         across = np.cross(self.sun, self.up) / np.linalg.norm(np.cross(self.sun, self.up))
         side = np.cos(about) * across + np.sin(about) * np.cross(self.sun, across)
         return np.cos(angle) * self.sun + np.sin(angle) * side
 
     def miss(self, light):
-        """Degrees between a light and the sun."""
+        """The angle between a light and the sun, in degrees."""
         length = np.linalg.norm(light.direction)
         return float(np.degrees(np.arccos(np.clip(self.sun @ light.direction / length, -1, 1))))
 
@@ -213,7 +218,7 @@ class Boxes:
         return scene.depth(self.mesh, camera, **size), camera
 
     def shadows(self, lights, index):
-        """For `fit.lights`: a finer map in each round, from the sun found so far."""
+        """The shadows for round `index` of `fit.lights`, of the sun as estimated."""
         scale = self.scales[index]
         seen = self.seen_from(lights[1].direction, scale)
         return None, shadow.MovingShadow(*seen, self.gbuffer, self.eye, softness=1 / scale)

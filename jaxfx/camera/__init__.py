@@ -4,7 +4,7 @@
 |---|---|
 | a perspective camera by its field of view | `PinholeCamera.from_fov` |
 | one that looks at a point | `PinholeCamera.look_at` |
-| one from another program | `from_opencv`, `from_colmap`, `from_blender`, `from_nerf`, `from_opengl` |
+| one from OpenCV, COLMAP, Blender, NeRF or OpenGL | `PinholeCamera.from_opencv` and so on |
 | parallel rays, for the shadow map of a sun, say | `OrthographicCamera` |
 | pixels of world points, and back | `project`, `unproject` |
 | the world point that each pixel of a depth image shows | `points` |

@@ -245,7 +245,7 @@ class PinholeCamera(eqx.Module):
           is ignored, as in Blender.
         - `lens`: focal length, in the unit of the sensor: millimetres.
         - `height`, `width`: static; the render's size in square pixels, after its percentage.
-        - `sensor_width`, `sensor_height`: the sensor's size, in millimetres.
+        - `sensor_width`, `sensor_height`: the sensor's size, in the unit of `lens`.
         - `sensor_fit`: which length the field of view fits: "AUTO" the sensor's width, along
           the image's longer side; "HORIZONTAL" the width, along rows; "VERTICAL" the height,
           along columns.

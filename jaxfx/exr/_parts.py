@@ -54,8 +54,8 @@ def read_parts(path: StrPath, max_pixels: int, verify: bool) -> list[Part]:
     """Every part with every channel; `ValueError` names the file where one can't be read."""
     data = Path(path).read_bytes()
     if data[:4] != _MAGIC:
-        found = f"got one that begins with {data[:4]!r}" if data else "got an empty one"
-        raise ValueError(f"`{path}` must be an OpenEXR file, {found}.")
+        got = f"one that begins with {data[:4]!r}" if data else "an empty one"
+        raise ValueError(f"`{path}` must be an OpenEXR file, got {got}.")
     if verify:
         _seal.verify(path, data)
     if data[5:6] and data[5] & _DEEP:

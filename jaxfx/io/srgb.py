@@ -19,7 +19,7 @@ from jaxfx._files import StrPath
 _SRGB = (b"sRGB", "sRGB".encode("utf-16-be"))
 
 
-def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def srgb_from_linear(linear: Float[ArrayLike, "*shape"] | float) -> Float[np.ndarray, "*shape"]:
     """The sRGB curve: from linear light to the numbers that screens and files take.
 
     **Arguments:** `linear`: any shape; 0 is black, 1 the screen's white.
@@ -45,7 +45,7 @@ def srgb_from_linear(linear: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*
     return curve.astype(dtype)
 
 
-def linear_from_srgb(srgb: Float[ArrayLike, "*shape"]) -> Float[np.ndarray, "*shape"]:
+def linear_from_srgb(srgb: Float[ArrayLike, "*shape"] | float) -> Float[np.ndarray, "*shape"]:
     """Linear light from sRGB numbers: the inverse of `srgb_from_linear`.
 
     **Arguments:** `srgb`: any shape, 0 to 1.

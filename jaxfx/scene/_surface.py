@@ -24,6 +24,8 @@ _DIELECTRIC = 0.04
 # that a rasteriser gave to a face which their centre just misses; more lets the depth of a face
 # seen edge-on run away.
 _SLACK = 0.05
+# In float32, so that signs do not turn normals to float64.
+_ONE = np.float32(1)
 
 
 class Hits(NamedTuple):
@@ -128,10 +130,9 @@ def _normals(scene: Scene, view: View, hits: Hits) -> Float[np.ndarray, "3 hit"]
     flipped where the camera sees the back. Where one still points away from the camera, as at a
     silhouette, its component along the ray is removed.
     """
-    one = np.float32(1)
     flat = view.turn(hits.normal).astype(np.float32)
     toward = view.turn(_unit(hits.toward)).astype(np.float32)
-    normal = _fronts(scene, hits, flat) * np.where(hits.front, one, -one)
+    normal = _fronts(scene, hits, flat) * np.where(hits.front, _ONE, -_ONE)
     return _unit(normal - np.maximum(_dot(normal, toward), 0) * toward)
 
 
@@ -139,9 +140,8 @@ def _fronts(
     scene: Scene, hits: Hits, flat: Float[np.ndarray, "3 hit"]
 ) -> Float[np.ndarray, "3 hit"]:
     """Interpolated unit normals with normal maps applied, on the side of the face normals."""
-    one = np.float32(1)
     normal = _interpolate(scene.normals, hits.face, hits.weights)
-    normal *= np.where(_dot(normal, flat) < 0, -one, one)
+    normal *= np.where(_dot(normal, flat) < 0, -_ONE, _ONE)
     return _normal_mapped(scene, hits, _unit(np.where((normal == 0).all(axis=0), flat, normal)))
 
 

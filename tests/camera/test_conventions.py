@@ -1,4 +1,4 @@
-"""Each convention's own formula, written out, against the camera that is made of it."""
+"""Each program's own formula, written out, against the camera made from its numbers."""
 
 import inspect
 
@@ -85,7 +85,7 @@ def test_colmap(model, params, length):
 
 
 def matrix_world(scale=1.0):
-    """World from a camera that looks along -z with y up, and the points in its axes."""
+    """The pose of a camera that looks along -z with y up, and the points in its axes."""
     pose = np.eye(4)
     pose[:3, :3] = rotation(3)
     pose[:3, 3] = [1, -2, 0.5]
@@ -122,7 +122,7 @@ def test_blender(fit, size, shift):
 
 
 def test_blender_as_it_comes():
-    """A field of view of 2 atan(36 / 2 / 50) along rows, no turn: its y up is our up."""
+    """A field of view of 2 atan(36 / 2 / 50) along rows, without rotation."""
     camera = PinholeCamera.from_blender(np.eye(4), lens=50, height=HEIGHT, width=WIDTH)
     edge = 18 / 50
     pixels, _ = camera.project(np.array([[edge, 0, -1], [0, edge, -1]]))
@@ -132,7 +132,7 @@ def test_blender_as_it_comes():
 
 
 def test_nerf():
-    """Blender's pictures: `focal = 0.5 * w / tan(0.5 * camera_angle_x)`, rays along -z."""
+    """NeRF's code: `focal = 0.5 * w / tan(0.5 * camera_angle_x)`, rays along -z."""
     pose, local, world = matrix_world()
     angle = 0.69
     focal = 0.5 * WIDTH / np.tan(0.5 * angle)
@@ -171,7 +171,7 @@ def frustum(left, right, bottom, top, near, far):
 
 
 def test_opengl():
-    """Clip space, division by w, the viewport: (x + 1) / 2 of the width, rows from below."""
+    """Clip space, division by w, viewport: (x + 1) / 2 of the width, rows from the bottom."""
     pose, local, world = matrix_world()
     projection = frustum(-0.06, 0.09, -0.05, 0.07, 0.1, 100.0)
     projection[0, 1] = 0.02  # a skew

@@ -1,4 +1,4 @@
-"""The camera of parallel rays; `test_pinhole.py` tests what it shares with the other."""
+"""The orthographic camera; `test_pinhole.py` tests what both cameras share."""
 
 import numpy as np
 import pytest

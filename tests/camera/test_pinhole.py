@@ -25,7 +25,7 @@ def rigid(rng):
 
 
 def pinhole(rng):
-    """Oblong pixels, a skew and a principal point off the middle."""
+    """Intrinsics with oblong pixels, a skew and an off-centre principal point."""
     intrinsics = [
         [rng.uniform(40, 90), rng.normal(), 31],
         [0, rng.uniform(40, 90), 23],
@@ -161,7 +161,7 @@ def test_look_at(seed):
     np.testing.assert_allclose(np.linalg.det(axes), 1, rtol=1e-12)
     np.testing.assert_array_equal(camera.world_from_camera[:3, 3], eye)
     np.testing.assert_array_equal(camera.world_from_camera[3], [0, 0, 0, 1])
-    # Up is straight up in the picture, and to the right is right of the view.
+    # Up is up in the image, and right is right.
     (x, y), _ = project(camera, jnp.asarray(target + 1e-3 * up))
     assert y < 20
     np.testing.assert_allclose(x, 35, atol=1e-9)
@@ -188,7 +188,7 @@ def test_look_at_has_a_finite_gradient_where_the_pose_is_degenerate():
 @hyp.given(st.integers(0, 2**32))
 @hyp.settings(max_examples=20, deadline=None)
 def test_through_lens(seed):
-    """The focus plane stays; other depths move by offset * f * (1 / Zf - 1 / Z)."""
+    """Points in focus keep their pixel; others move by offset * f * (1 / Zf - 1 / Z)."""
     rng = np.random.default_rng(seed)
     camera = pinhole(rng)
     offset, distance = rng.normal(size=2), rng.uniform(1, 5)
@@ -223,7 +223,7 @@ def test_the_focus_plane_stays_within_1e_12():
 
 @first("make", CAMERAS)
 def test_gradients_of_project_and_unproject(rng, make):
-    """In every field, the points, the pixels and the depth, both modes."""
+    """Derivatives in every field, the points, the pixels and the depth, in both modes."""
     camera = make(rng)
     points = points_before(camera, rng, 3)
     pixels, depth = project(camera, points)
@@ -254,7 +254,7 @@ def test_rays_and_points(rng, make):
     origins, directions = camera.rays(height=np.int64(3), width=5)
     assert origins.shape == directions.shape == (*size, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, rtol=1e-14)
-    # What lies on a ray is seen in the middle of its pixel.
+    # A point on a ray projects to the centre of its pixel.
     pixels, depth = camera.project(origins + 2.5 * directions)
     y, x = np.indices(size)
     np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1) + 0.5, rtol=1e-10)
@@ -280,7 +280,7 @@ def test_rays_and_points(rng, make):
 
 @first("make", CAMERAS)
 def test_types_of_what_is_given(rng, make):
-    """Integers and lists are numbers; halves are computed with as floats."""
+    """Integers and lists are accepted; float16 is computed in float32."""
     camera = make(rng)
     points = np.array([[1, 2, -3], [4, 0, 5]])
     expected = camera.project(points.astype(float))
@@ -341,7 +341,7 @@ def test_poses_that_are_not_rigid(kind):
         with pytest.raises(ValueError, match=message):
             make(pose)
         assert jax.jit(make)(pose) is not None  # A traced one can't be looked at.
-        # What a file rounds, and what is computed in halves, is rigid.
+        # Poses rounded by a file or by float16 count as rigid.
         make(np.round(rigid(np.random.default_rng(5)), 4))
         make(rigid(np.random.default_rng(5)).astype(np.float16))
 

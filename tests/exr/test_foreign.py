@@ -1,4 +1,4 @@
-"""EXR files that `write` did not write: other programs', and damaged ones."""
+"""EXR files of other programs, and damaged ones."""
 
 import struct
 
@@ -175,7 +175,7 @@ def with_window(data, *corners):
 @pytest.mark.parametrize(
     ("corners", "message"),
     [
-        # Whole chunks less: OpenEXR would return the first rows without a word.
+        # Whole chunks are missing: OpenEXR would return the first rows without an error.
         ((0, 0, 49, 31), "its height 32 does not fit its chunks"),
         ((0, 0, 49, 47), "damaged"),
         ((0, 0, 48, 39), "damaged"),
@@ -193,7 +193,7 @@ def test_a_damaged_data_window(tmp_path, capfd, corners, message):
 
 
 def test_mutated_files_raise_or_come_back_whole(tmp_path, capfd):
-    """With nothing to go by but the file's own order."""
+    """Without a checksum, by the structure of the file alone."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:40, :30].astype(np.float32)
     channels = {
@@ -229,7 +229,7 @@ def test_mutated_files_raise_or_come_back_whole(tmp_path, capfd):
                 assert str(path) in str(error)
                 raised[mutate] = raised.get(mutate, 0) + 1
             else:
-                # A letter of a name may differ: then there are more layers, of the same pixels.
+                # If a letter of a name has changed, there are more layers, of the same pixels.
                 assert all(layer.shape[:2] == (40, 30) for layer in layers.values())
                 assert sum(layer[0, 0].size for layer in layers.values()) == 7
     assert raised[cut] == 60

@@ -1,4 +1,4 @@
-"""Deep frame buffers in EXR files: read by us, OpenImageIO and Blender, named as Nuke does."""
+"""G-buffers in EXR files: read by this package, OpenImageIO and Blender; Nuke's names."""
 
 import pathlib
 import re
@@ -33,7 +33,7 @@ def gbuffer(dtype=np.float32, height=5, width=7):
 
 
 def camera(kind, dtype):
-    """One whose numbers have no short form."""
+    """A camera whose numbers have no short decimal form."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix()
     pose[:3, 3] = 1 / 3, -np.pi, np.e
@@ -58,8 +58,9 @@ def test_round_trip(tmp_path, dtype):
 def test_the_camera_is_kept_exactly(tmp_path, kind, dtype):
     before = camera(kind, dtype)
     exr.write_gbuffer(tmp_path / "a.exr", gbuffer(), camera=before)
-    _, after = exr.read_gbuffer(tmp_path / "a.exr")
-    assert eqx.tree_equal(before, after, typematch=True)
+    cache = exr.read_gbuffer(tmp_path / "a.exr")
+    assert cache._fields == ("gbuffer", "camera")
+    assert eqx.tree_equal(before, cache.camera, typematch=True)
 
 
 def test_double_precision_is_rounded(tmp_path):
@@ -114,7 +115,7 @@ def test_open_image_io_finds_the_passes(file):
 
 
 def test_blender_finds_the_passes(file, tmp_path):
-    """Its compositor shows each pass under its name, and every bit of every number."""
+    """Blender's compositor has each pass under its name, with every bit of its numbers."""
     blender = shutil.which("blender")
     if blender is None:
         pytest.skip("Blender is not installed, e.g. by apt-get install blender")
@@ -133,7 +134,7 @@ def test_blender_finds_the_passes(file, tmp_path):
 
 
 def nuke_name(channel):
-    """What Nuke calls a channel of an EXR file, by the source of its reader.
+    """Nuke's name for a channel of an EXR file, by the source of its reader.
 
     Foundry publishes that source with its development kit. The name is cut at its first two
     dots. Leading digits and empty parts go, and what is no letter or digit becomes `_`. The
@@ -167,7 +168,7 @@ def test_the_rule_of_nuke(channel, name):
 
 
 def test_nuke_finds_the_passes(file):
-    """Each under its name; its reader wants one data window, and all of it shown."""
+    """Nuke finds each layer under its name; it needs one data window, all of it displayed."""
     header = OpenEXR.File(str(file[1]), header_only=True).header()
     found = {nuke_name(channel.name) for channel in header["channels"]}
     colors = ("color", "ambient", "diffuse", "specular")
@@ -236,7 +237,7 @@ def test_a_damaged_camera(tmp_path, old, new, message):
 
 
 def test_the_passes_of_another_program(tmp_path):
-    """Without our attributes there is no checksum to fit, and no camera."""
+    """Without the package's attributes there is no checksum to check, and no camera."""
     before = gbuffer()
     exr.write_gbuffer(tmp_path / "a.exr", before)
     planes = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
@@ -250,7 +251,7 @@ def test_the_passes_of_another_program(tmp_path):
 
 @pytest.mark.parametrize("value", [0x01, 0x80, 0xFF])
 def test_no_byte_can_change_unnoticed(tmp_path, value):
-    """Every byte of the header and of the table of chunks, and a share of the chunks'."""
+    """Every byte of the header and of the chunk table, and some of the chunks'."""
     path = tmp_path / "a.exr"
     exr.write_gbuffer(path, gbuffer(height=40), camera=camera(PinholeCamera, np.float32))
     data = bytearray(path.read_bytes())

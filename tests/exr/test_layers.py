@@ -1,4 +1,4 @@
-"""EXR files: to the bit and back, the names in them, whole or not at all."""
+"""EXR files: every bit is read back, names, and writing whole or not at all."""
 
 import os
 import pathlib
@@ -18,7 +18,7 @@ from jaxfx import exr
 
 DTYPES = [np.float16, np.float32, np.uint32]
 
-# Views of an array that are laid out unlike a fresh one.
+# Views of an array that are not contiguous.
 LAYOUTS = {
     "plain": lambda a: a,
     "columns first": np.asfortranarray,
@@ -220,7 +220,7 @@ def test_folders_that_cannot_be_written(tmp_path, monkeypatch):
 
 
 def test_the_written_file_is_an_ordinary_one(tmp_path):
-    """Its mode is what the umask leaves, and a link stays a link."""
+    """The file's mode follows the umask, and a symbolic link stays one."""
     (tmp_path / "plain").touch()
     (tmp_path / "link.exr").symlink_to(tmp_path / "a.exr")
     exr.write(tmp_path / "link.exr", IMAGE)

@@ -1,4 +1,4 @@
-"""Each kind of EXR file that the standard allows: read right, or refused by name."""
+"""Each kind of EXR file of the standard: read correctly, or refused with its name."""
 
 import io
 import struct
@@ -22,7 +22,7 @@ LOSSY = ["PXR24", "B44", "B44A", "DWAA", "DWAB"]
 
 
 def smooth(dtype=np.float32, size=(37, 53)):
-    """A ramp in both directions, near enough to a photograph for a lossy code."""
+    """A ramp in both directions, smooth enough for lossy compression."""
     y, x = np.mgrid[: size[0], : size[1]]
     return (0.2 + 0.01 * x + 0.005 * y).astype(dtype)
 
@@ -100,7 +100,7 @@ def test_a_data_window_within_around_and_beside_the_display(tmp_path, corner):
 
 
 def test_long_names(tmp_path):
-    """Past 31 bytes a file of an older version could not have them."""
+    """Names longer than 31 bytes, which older versions of the format do not allow."""
     name = "a very long layer name, of 200 bytes ".ljust(200, "_")
     write(tmp_path / "a.exr", {f"{name}.V": smooth()})
     assert_layers(exr.read(tmp_path / "a.exr"), {name: smooth()})
@@ -116,7 +116,7 @@ def test_views_in_one_part(tmp_path):
 
 
 def part(name, header=FLAT, size=(37, 53), view=None, **planes):
-    """A part of planes that differ by a number; all share one display."""
+    """A part whose values are offset by a number; all parts share one display window."""
     display = (np.zeros(2, np.int32), np.array([52, 36], np.int32))
     named = {channel.replace("_", "."): smooth(size=size) + v for channel, v in planes.items()}
     seen = {} if view is None else {"view": view}
@@ -287,7 +287,7 @@ print(dict(counts))
 
 
 def test_reading_under_a_redirect_of_others(tmp_path, monkeypatch):
-    """Another thread's prints go where that thread sent them, and no good file is refused."""
+    """Output of other threads is not swallowed, and no good file is refused."""
     exr.write(tmp_path / "a.exr", np.ones((60, 80, 3), np.float32))
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     done = threading.Event()

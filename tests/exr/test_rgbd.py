@@ -1,4 +1,4 @@
-"""An image and its depth from one file, with the names that renderers write."""
+"""An image and its depth from one file, by the names that renderers write."""
 
 import numpy as np
 import OpenEXR
@@ -44,10 +44,11 @@ CLEAN = np.where(np.arange(6)[:, None] == 0, np.inf, np.full(SIZE, 2.5))
 def test_blender_multilayer(tmp_path, dtype, sky):
     path = tmp_path / "a.exr"
     blender(path, {"ViewLayer": depth(sky)}, dtype)
-    found_image, found_depth = exr.read_rgbd(path)
-    assert found_image.dtype == found_depth.dtype == np.float32
-    np.testing.assert_array_equal(found_image, image())
-    np.testing.assert_array_equal(found_depth, CLEAN)
+    rgbd = exr.read_rgbd(path)
+    assert rgbd._fields == ("image", "depth")
+    assert rgbd.image.dtype == rgbd.depth.dtype == np.float32
+    np.testing.assert_array_equal(rgbd.image, image())
+    np.testing.assert_array_equal(rgbd.depth, CLEAN)
 
 
 @pytest.mark.full
@@ -122,7 +123,7 @@ def views(windows=(None, None), has_view=True):
 
 @pytest.mark.parametrize("has_view", [True, False])
 def test_a_view_for_each_part(tmp_path, has_view):
-    """Without a name the first."""
+    """Passes without a prefix belong to the first view."""
     OpenEXR.File(views(has_view=has_view)).write(str(tmp_path / "a.exr"))
     layers = {None: 0, "right": 1} | ({"left": 0} if has_view else {})
     for layer, i in layers.items():
@@ -171,7 +172,7 @@ def test_pixels_that_lie_elsewhere_are_refused(tmp_path):
     )
     with pytest.raises(ValueError, match=r"a.exr` must have `` and `depth` in the same pixels"):
         exr.read_rgbd(tmp_path / "a.exr")
-    # Views may lie where they like.
+    # Data windows of other views do not matter.
     OpenEXR.File(views((one, other))).write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(
         exr.read_rgbd(tmp_path / "a.exr", layer="right")[1], CLEAN + 1

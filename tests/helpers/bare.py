@@ -1,4 +1,4 @@
-"""Every effect on arrays, for an environment that has jaxfx without extras, and no pytest.
+"""Calls every effect in an environment that has jaxfx without extras, and no pytest.
 
 Prints how many functions it called. `tests/test_install.py` runs it.
 """
@@ -54,7 +54,7 @@ DEPTH_OF_FIELD = (
 
 
 def effects():
-    """A call of every public function of every effect, by name: arguments, then options."""
+    """The arguments and options of a call of every public function of the effects, by name."""
     calls = {name: ((image, depth, lens), {"max_coc": 6}) for name in DEPTH_OF_FIELD}
     calls |= {
         f"shadow.{name}": ((depth, receivers), {"size": 3})
@@ -97,7 +97,7 @@ def public():
 
 
 def missing(extra, call):
-    """That a call names the extra which it needs."""
+    """Assert that a call raises an error that names the extra which it needs."""
     try:
         call()
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""What programs hold, and those for accelerators on a CPU."""
+"""The operations of programs; and tracing of the programs for accelerators, on a CPU."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from jax.extend import core
 
 
 def primitives(jaxpr: Any, skip: tuple[str, ...] = ()) -> Iterator[str]:
-    """The names of all operations, but for those inside of what is skipped."""
+    """The names of all operations, except those inside operations named in `skip`."""
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         if equation.primitive.name not in skip:
@@ -23,12 +23,12 @@ def primitives(jaxpr: Any, skip: tuple[str, ...] = ()) -> Iterator[str]:
 
 @contextlib.contextmanager
 def for_accelerators() -> Iterator[None]:
-    """Trace the programs for accelerators, whatever they then run on."""
+    """Trace the programs for accelerators, whatever device they then run on."""
 
     def default(*operands: Any, default: Callable[..., Any], **_: Any) -> Any:
         return default(*operands)
 
-    # What was traced before knows the other program, and what is traced here this one.
+    # Traces made outside hold the CPU's program, and those made inside the accelerator's.
     jax.clear_caches()
     try:
         with mock.patch.object(jax.lax, "platform_dependent", default):

@@ -1,4 +1,4 @@
-"""Programs that are quick to compile, for tests that ask neither for speed nor for memory."""
+"""Compilation with little optimisation, for tests that measure neither speed nor memory."""
 
 import contextlib
 import functools
@@ -11,11 +11,11 @@ from jax.test_util import check_jvp, check_vjp
 
 @contextlib.contextmanager
 def _compiled(is_optimised: bool) -> Iterator[None]:
-    """Compile with all optimisation, or with little, whatever is compiled in this context.
+    """Compile with all optimisation, or with little, in this context.
 
-    JAX keeps compiled programs by function, types and a few settings, of which optimisation is
-    not one. The precision of matrix products is: it changes no value on a CPU, and keeps the
-    two kinds of programs apart.
+    JAX caches compiled programs by function, types and a few settings. Optimisation is not one
+    of them; the precision of matrix products is. It changes no value on a CPU, so it serves to
+    keep the two kinds of programs apart.
     """
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", not is_optimised)

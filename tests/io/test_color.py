@@ -1,4 +1,4 @@
-"""Images of colour from any file, by what is in it."""
+"""Images from PNG, JPEG and EXR files, recognised by their first bytes."""
 
 import io as streams
 
@@ -14,7 +14,7 @@ FLAT = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
 
 def codes(size=(24, 40), channels=3):
-    """A smooth image, 8 bits, that differs in every corner."""
+    """A smooth 8-bit image with different colours in all corners."""
     y, x = np.mgrid[: size[0], : size[1]]
     planes = [20 + 4 * x, 200 - 3 * y, 40 + 2 * x + 2 * y, 255 - x]
     return np.stack(planes[:channels], axis=-1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Depth from files: the numbers as they are stored, or a file refused by name."""
+"""Depth from files: the stored numbers, or an error that names the file."""
 
 import inspect
 
@@ -71,7 +71,7 @@ def test_other_png_is_refused(tmp_path, picture, message):
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("size", [b"1", b"1.0", b"0.003922", b"1e+0"])
 def test_pfm(tmp_path, order, size):
-    """From the bottom up; the scale's sign is the order of bytes, its size is for viewers."""
+    """The bottom row comes first; the scale's sign is the byte order, its size is ignored."""
     sign = b"-" if order == "<" else b""
     body = metres()[::-1].astype(f"{order}f4").tobytes()
     (tmp_path / "a.pfm").write_bytes(b"Pf\n7 5\n" + sign + size + b"\n" + body)
@@ -158,7 +158,7 @@ def test_objects_are_not_loaded(tmp_path):
 
 
 def test_the_depth_of_an_exr_file(tmp_path):
-    """Not the first channel of the alphabet."""
+    """The depth is chosen by its name, not by the order of channels."""
     path = tmp_path / "a.exr"
     names = ["A", "AO.V", "B", "G", "R", "Mist.V", "Z"]
     planes = {name: metres() if name == "Z" else 0 * metres() for name in names}

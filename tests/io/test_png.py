@@ -26,7 +26,7 @@ def chunk(kind, body):
 
 
 def png(pixels, facts=b""):
-    """A file of `pixels`, 8 or 16 bits, whose rows take turns with the five filters.
+    """A PNG file of `pixels`, 8 or 16 bits; its rows use the five filters in turn.
 
     `facts` are chunks between its header and its pixels.
     """
@@ -49,7 +49,7 @@ def png(pixels, facts=b""):
 
 
 def linear(codes, largest):
-    """The definition, in float64: the curve on colours, alpha as it is."""
+    """The definition, in float64: the curve on colours, alpha unchanged."""
     values = codes / largest
     colors = codes.shape[2] - (codes.shape[2] + 1) % 2
     curved = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
@@ -83,7 +83,7 @@ def test_every_code_comes_back(tmp_path, channels):
 
 
 def test_write_clips_and_rounds(tmp_path):
-    """To the nearest code, half a code each way; nothing wraps around."""
+    """Values are rounded to the nearest code and clipped; nothing wraps around."""
     half = linear(np.array([[[100.49], [100.51]]]), 255)
     bad = np.array([[[-1.0], [7.0], [np.inf], [-np.inf], [np.nan]]])
     io.write_png(tmp_path / "a.png", np.concatenate([half, bad], axis=1))
@@ -142,7 +142,7 @@ def test_a_transparent_grey_of_few_bits(tmp_path, bits):
 
 @pytest.mark.parametrize("gamma", [1.0, 0.55, 1 / 2.2])
 def test_the_gamma_that_the_file_names(tmp_path, gamma):
-    """1 says linear; that of sRGB, which is no power, means the curve."""
+    """A gamma of 1 is linear; that of sRGB means sRGB's curve, which is no power."""
     codes = np.arange(256, dtype=np.uint8).reshape(8, 8, 4)
     fact = chunk(b"gAMA", struct.pack(">I", round(1e5 * gamma)))
     (tmp_path / "a.png").write_bytes(png(codes, fact))

@@ -17,7 +17,7 @@ def test_the_curve_of_other_types(name):
         found = curve(given)
         assert found.dtype == given.dtype.newbyteorder("=")
         exact = curve(given.astype(np.float64))
-        # Computed in float32 at least: a half is off by its own rounding alone.
+        # Computed in float32 or wider: a float16 result differs by its own rounding only.
         rounding = np.finfo(found.dtype).eps / 2 + 4 * np.finfo(np.float32).eps
         np.testing.assert_allclose(found.astype(float), exact, rtol=rounding, atol=1e-7)
     for wrong in (np.array([0, 127, 255], np.uint8), np.array([65535], np.uint16), [0, 1]):
@@ -40,7 +40,7 @@ def test_the_curve_and_its_inverse(dtype):
     light = io.linear_from_srgb(codes)
     back = io.srgb_from_linear(light)
     assert light.dtype == back.dtype == dtype
-    # At the joint the two pieces of the standard miss each other by 3e-8.
+    # The standard's two pieces differ by 3e-8 where they join.
     np.testing.assert_allclose(back, codes, rtol=20 * np.finfo(dtype).eps, atol=1e-7)
     assert np.all(np.diff(light) >= 0)
 

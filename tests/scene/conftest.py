@@ -29,7 +29,7 @@ def backend(request):
 
 @pytest.fixture
 def both_backends():
-    """The two names, where both work."""
+    """The names of both backends, on a machine where both work."""
     return _require("embree"), _require("opengl")
 
 
@@ -52,7 +52,7 @@ def _cameras():
 
 @pytest.fixture(params=["pinhole", "off-axis", "skewed", "orthographic"])
 def camera(request):
-    """A camera for 60 x 83 pixels that looks at the origin from 6 away."""
+    """A camera of 60 x 83 pixels that looks at the origin from a distance of 6."""
     return _cameras()[request.param]
 
 
@@ -81,7 +81,7 @@ def rays():
 
 @pytest.fixture
 def straight():
-    """An orthographic camera whose picture is [0, width] x [0, height] of the plane z = 0.
+    """An orthographic camera whose image is [0, width] x [0, height] of the plane z = 0.
 
     A pixel is a scene unit; y points up in the world and down in the picture.
     """
@@ -122,7 +122,7 @@ def complain(backend):
 
 @pytest.fixture
 def fresh_python():
-    """Run code in a Python of its own, in which a warning is an error and libraries lack.
+    """Run code in a new Python process, with warnings as errors and some libraries missing.
 
     The code may call `depth(backend)` and `complain(backend)`. It gives what went to the
     standard output and to the standard error.
@@ -145,7 +145,7 @@ def fresh_python():
 
 
 class GltfFile:
-    """A glTF document that is written down piece by piece, from the standard alone."""
+    """A glTF document, assembled by the standard without any code of the package."""
 
     KINDS = MappingProxyType(
         {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
@@ -164,7 +164,7 @@ class GltfFile:
         return len(self.json["bufferViews"]) - 1
 
     def accessor(self, rows, dtype="f4", *, gap=0, **more):
-        """Rows of numbers, `gap` bytes of rubbish behind each."""
+        """An accessor of rows of numbers, with `gap` unused bytes after each row."""
         rows = np.asarray(rows, f"<{dtype}")
         rows = rows.reshape(len(rows), -1)
         data = b"".join(row.tobytes() + b"\xaa" * gap for row in rows)
@@ -187,7 +187,7 @@ class GltfFile:
         return one | ({} if material is None else {"material": material})
 
     def material(self, image, sampler=None, **more):
-        """A dielectric whose base colour is an image; `more` goes into the texture's info."""
+        """A dielectric with an image as base colour; `more` is added to the texture's info."""
         for key in ("images", "textures", "samplers", "materials"):
             self.json.setdefault(key, [])
         self.json["images"].append({"uri": image})
@@ -202,7 +202,7 @@ class GltfFile:
         return len(self.json["materials"]) - 1
 
     def save(self, *primitives, name="a.gltf", **top):
-        """The file with one mesh of these primitives, at one node unless `top` says others."""
+        """The file, with one mesh of these primitives at one node, or the nodes of `top`."""
         (self.folder / "a.bin").write_bytes(self.binary)
         whole = {
             "buffers": [{"byteLength": len(self.binary), "uri": "a.bin"}],
@@ -233,7 +233,7 @@ TEXELS = np.array(
 
 @pytest.fixture
 def uv():
-    """Texture coordinates of `GltfFile.quad`, as glTF counts v: the image the right way up."""
+    """Texture coordinates of `GltfFile.quad` that show the image upright; v as in glTF."""
     return UV
 
 
@@ -246,7 +246,7 @@ def texels(tmp_path):
 
 @pytest.fixture
 def codes(straight):
-    """What a mesh over [0, 3] x [0, 2] shows, `scale` pixels a unit, as sRGB bytes."""
+    """The image of a mesh over [0, 3] x [0, 2], `scale` pixels per unit, as sRGB bytes."""
 
     def look(mesh, scale=1):
         buffer = scene.gbuffer(

@@ -1,4 +1,4 @@
-"""Embree: no ray slips through between faces."""
+"""Embree: no ray passes between adjacent faces."""
 
 import numpy as np
 import trimesh
@@ -8,7 +8,7 @@ from jaxfx.scene import embree
 
 
 def test_no_ray_slips_between_faces(camera, backend, rays):
-    """A sheet of triangles whose vertices lie on the pixels' rays, to rounding."""
+    """A mesh whose vertices lie on the pixels' rays, up to rounding."""
     height, width = 60, 83
     near, direction = rays(camera, height, width)
     depth = np.random.default_rng(0).uniform(4, 8, (height, width))
@@ -24,7 +24,7 @@ def test_no_ray_slips_between_faces(camera, backend, rays):
 
 
 def test_rays_at_edges():
-    """Of rays from the centre at the middles of a ball's edges, nearly all meet a face.
+    """Nearly all rays from a ball's centre through the middles of its edges meet a face.
 
     A scene that is not robust loses one in ten.
     """

@@ -23,7 +23,7 @@ TEXELS = np.array(
 
 
 def textured_quad(folder, *, material="", repeat=1):
-    """A quad over [0, 3] x [0, 2], its picture of 3 x 2 texels the right way up."""
+    """A quad over [0, 3] x [0, 2] with an upright texture of 3 x 2 texels."""
     Image.fromarray(TEXELS).save(folder / "texels.png")
     (folder / "quad.mtl").write_text(f"newmtl paint\nmap_Kd texels.png\n{material}\n")
     (folder / "quad.obj").write_text(
@@ -53,7 +53,7 @@ def test_textures_are_bilinear_and_repeat(tmp_path, straight):
     texels = linear(TEXELS)
 
     def texel(x, y):
-        """The same read from the definition, one pixel at a time."""
+        """The texture lookup by its definition, one pixel at a time."""
         column, row = int(np.floor(x - 0.5)), int(np.floor(y - 0.5))
         s, t = x - 0.5 - column, y - 0.5 - row
         at = lambda j, i: texels[j % 2, i % 3]
@@ -63,7 +63,7 @@ def test_textures_are_bilinear_and_repeat(tmp_path, straight):
 
     expected = [[texel((i + 0.5) / 2, (j + 0.5) / 2) for i in range(6)] for j in range(4)]
     np.testing.assert_allclose(buffer.color, expected, atol=1e-6)
-    # The same picture three times over each way, seen from the same place.
+    # The texture repeated three times along each axis, from the same camera.
     tiled = scene.load(textured_quad(tmp_path, repeat=3))
     buffer = scene.gbuffer(tiled, straight(6, 3), height=6, width=9, backend="embree")
     np.testing.assert_allclose(buffer.color, np.tile(texels, (3, 3, 1)), atol=1e-5)
@@ -147,7 +147,7 @@ def test_glb_factors(tmp_path, straight, backend):
 
 @pytest.mark.parametrize("metallic", [{"metallicFactor": 1.0}, {}])
 def test_glb_metal_however_rough_is_no_lambertian(tmp_path, straight, metallic):
-    """All that a metal gives back is specular; and metal is what glTF takes for granted."""
+    """A metal reflects specularly only; glTF's default is metal."""
     path = glb_quad(
         tmp_path, baseColorFactor=[51, 102, 255, 255], roughnessFactor=1.0, **metallic
     )
@@ -194,7 +194,7 @@ def test_node_transforms(tmp_path, straight, mirror):
     buffer = scene.gbuffer(quad, straight(2), height=2, width=3, backend="embree")
     np.testing.assert_allclose(buffer.color, linear(TEXELS)[:, ::mirror], atol=1e-6)
     np.testing.assert_allclose(buffer.depth, 5, rtol=1e-6)
-    # The front stays the front: it is what shows as a second layer behind a screen.
+    # The front stays the front: behind a screen it is the second layer.
     screen = trimesh.creation.box((10, 10, 0.1))
     content = trimesh.load_scene(path)
     content.add_geometry(

@@ -1,4 +1,4 @@
-"""Normal maps against tangent frames written down by hand, and which material a pixel shows."""
+"""Normal maps against tangent frames written by hand; the material that a pixel shows."""
 
 import numpy as np
 import trimesh
@@ -7,7 +7,7 @@ from PIL import Image
 from jaxfx import scene
 
 
-# Bent along u; along v; both; not at all (128 is as near as bytes come).
+# Tilted along u, along v, along both, not at all (128 is the nearest byte to 0.5).
 MAP = np.array(
     [
         [[230, 128, 200], [128, 230, 200], [60, 90, 220]],
@@ -61,7 +61,7 @@ def test_mirrored_texture_coordinates_mirror_the_bend(straight):
 
 
 def test_tangents_turn_with_the_texture(straight):
-    """Texture coordinates turned by a quarter: u runs up, v to the left."""
+    """Texture coordinates rotated by 90 degrees: u points up, v to the left."""
     turned = np.stack([UV[:, 1], 1 - UV[:, 0]], axis=1)
     flat = np.full((2, 3, 3), MAP[0, 0])
     bent = unit(MAP[0, 0] / 127.5 - 1)
@@ -71,7 +71,7 @@ def test_tangents_turn_with_the_texture(straight):
 
 
 def test_the_back_shows_the_same_bumps_from_behind(straight):
-    """Turned by half about y: what stood out of the front now lies in the back."""
+    """Rotated by 180 degrees about y: bumps on the front are dents seen from the back."""
     half = np.diag([-1.0, 1.0, -1.0, 1.0])
     half[0, 3] = 3
     expected = -(BENT[:, ::-1] * [-1, 1, -1])

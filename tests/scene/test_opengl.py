@@ -1,4 +1,4 @@
-"""OpenGL: one context for all threads, sizes and scenes; and a machine without it."""
+"""OpenGL: one context for all threads, sizes and scenes; a machine without OpenGL."""
 
 import gc
 from concurrent.futures import ThreadPoolExecutor
@@ -30,7 +30,7 @@ def test_sizes_and_scenes_may_change_from_call_to_call(backend):
 
 @pytest.mark.full
 def test_a_scene_that_is_gone_makes_room(backend, ball):
-    """Buffers belong to a scene, not to the place in memory where it was."""
+    """Buffers belong to a scene, not to an address that a new scene may get."""
     view = scene.default_camera(ball, **SIZE)
     for sides in (3, 4, 6, 12, 3, 12, 4):
         prism = trimesh.creation.cylinder(0.8, 0.8, sections=sides)
@@ -67,7 +67,7 @@ def test_subpixel_snapping_bends_no_plane(straight):
 
 @pytest.mark.parametrize("size", [1.0, 1e3, 1e5])
 def test_a_box_close_by_in_a_large_dome(backend, size):
-    """What is near is seen, however large the scene around it."""
+    """A near object is visible in a scene that is much larger."""
     dome = trimesh.creation.icosphere(2, radius=3 * size)
     world = scene.from_trimesh(trimesh.Scene([trimesh.creation.box((1, 1, 1)), dome]))
     for away in (0.5, 0.01):
@@ -79,7 +79,7 @@ def test_a_box_close_by_in_a_large_dome(backend, size):
 
 
 def test_a_floor_below_the_eye(backend):
-    """It goes on from the eye's own plane to behind it."""
+    """The floor extends from the front of the eye's plane to behind it."""
     floor = trimesh.Trimesh(
         [[-99, -1, -99], [99, -1, -99], [99, -1, 99], [-99, -1, 99]], [[0, 2, 1], [0, 3, 2]]
     )
@@ -94,7 +94,7 @@ def test_a_floor_below_the_eye(backend):
 
 @pytest.mark.parametrize(("height", "width"), [(2, 20000), (20000, 1)])
 def test_wider_than_opengl_draws_at_once(backend, straight, height, width):
-    """Squares of 125 pixels in a row, each a face of its own pair: which one is where."""
+    """A row of squares of 125 pixels, larger than a tile, of different faces."""
     side, count = 125, 160
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     step = np.array([1, 0, 0] if width > height else [0, 1, 0])
@@ -139,7 +139,7 @@ def test_without_embree_and_opengl(fresh_python):
 )
 @pytest.mark.full
 def test_without_opengl(fresh_python, without, environment):
-    """Embree is taken and said once; OpenGL, asked for, is refused; the variable stays."""
+    """Embree is chosen and logged once, OpenGL is refused, the environment is unchanged."""
     printed, complaint = fresh_python(
         "assert (depth() == depth('embree')).all()\n"
         "depth()\n"

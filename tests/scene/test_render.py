@@ -1,4 +1,4 @@
-"""The public calls: layers, empty views and bad arguments."""
+"""The public functions that render: layers, empty views and bad arguments."""
 
 import inspect
 
@@ -17,7 +17,7 @@ SIZE = {"height": 20, "width": 30}
 
 @pytest.fixture
 def view(ball):
-    """A camera of 20 x 30 pixels that has the ball in its picture."""
+    """A camera of 20 x 30 pixels that shows the ball."""
     return scene.default_camera(ball, **SIZE)
 
 
@@ -38,7 +38,7 @@ def test_layers_of_a_box_skip_its_inside(straight, backend):
 
 @pytest.mark.parametrize("tilt", [0.2, 1e-3, 1e-4])
 def test_a_floor_seen_edge_on_does_not_show_behind_itself(backend, tilt):
-    """Rounding goes a long way along a grazing ray."""
+    """Along a grazing ray a rounding error in position is a large error in depth."""
     turn = trimesh.transformations.euler_matrix(0.3, 0.5, 0.7)[:3, :3]
     corners = np.array([[-20, 0, -40], [20, 0, -40], [20, 0, 0], [-20, 0, 0]]) @ turn.T
     floor = scene.from_trimesh(trimesh.Trimesh(corners, [[2, 1, 0], [3, 2, 0]], process=False))
@@ -70,7 +70,7 @@ def test_nothing_in_view(backend, ball):
 
 @pytest.mark.parametrize("name", ["gbuffer", "depth", "object_ids", "material_ids"])
 def test_bad_arguments(name, ball, view):
-    # The annotations, checked in these tests, would speak first.
+    # Unwrapped: jaxtyping's error would come before ours.
     call = inspect.unwrap(getattr(scene, name))
     for size in (
         {"height": 0, "width": 9},

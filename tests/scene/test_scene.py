@@ -1,4 +1,4 @@
-"""The scene's own checks and measures."""
+"""The checks and the properties of a scene."""
 
 import inspect
 
@@ -25,7 +25,7 @@ def arrays(**changes):
 
 
 def build(kind, **arguments):
-    """An instance by the bare constructor: the annotations, checked here, would speak first."""
+    """A scene by the unwrapped constructor: jaxtyping's error would come before ours."""
     made = object.__new__(kind)
     inspect.unwrap(kind.__init__)(made, **arguments)
     return made

@@ -1,4 +1,4 @@
-"""The built-in scene: the same every time, from near to far, without seams."""
+"""The built-in scene: reproducible, with objects near and far, textures without seams."""
 
 import numpy as np
 import pytest
@@ -30,10 +30,10 @@ def test_still_life_reaches_from_near_to_far(room, height, width):
     ids = np.asarray(scene.object_ids(room, camera, **size))
     seen = {room.names[i] for i in np.unique(ids)}
     assert {"near ball", "near rod 0", "marble", "far ball", "far rod 3", "wall"} <= seen
-    # Things before, in and behind a focus at 2.8, each over a good part of the picture.
+    # Objects before, at and behind a focus of 2.8 each cover a good part of the image.
     for low, high in [(0, 1.5), (2.2, 3.5), (5, 9)]:
         assert np.mean((depth > low) & (depth < high)) > 0.05
-    # Saturated colours, and detail that stays within the picture's means.
+    # Saturated colours, and fine detail that still averages out.
     color = np.asarray(buffer.color)
     assert np.mean(np.ptp(color, axis=-1) > 0.3) > 0.3
     assert set(np.unique(buffer.shader)) == {0, 2}
@@ -41,7 +41,7 @@ def test_still_life_reaches_from_near_to_far(room, height, width):
 
 @pytest.mark.parametrize("name", ["near ball", "marble", "far ball", "near post"])
 def test_still_life_has_no_seams(room, name):
-    """Faces that meet at a vertex read the same texel there, and none spans the picture."""
+    """Faces that share a vertex have the same texel there; no face spans the texture."""
     mine = room.face_objects == room.names.index(name)
     corners, uv = room.vertices[room.faces[mine]], room.uv[mine].astype(float)
     middle = (corners.min((0, 1)) + corners.max((0, 1))) / 2

@@ -1,4 +1,4 @@
-"""Buffers against closed forms, a plain loop over all triangles, and one backend another."""
+"""G-buffers against closed forms and a loop over all triangles; both backends compared."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SIZE = {"height": HEIGHT, "width": WIDTH}
 
 
 def clutter(seed=5, count=60):
-    """Large triangles about the origin in all directions, through one another."""
+    """Large triangles about the origin, of all orientations, that intersect one another."""
     random = np.random.default_rng(seed)
     corners = random.uniform(-1.5, 1.5, (count, 1, 3)) + random.uniform(
         -1.5, 1.5, (count, 3, 3)
@@ -25,7 +25,7 @@ def clutter(seed=5, count=60):
 
 
 def every_hit(triangles, near, direction):
-    """Depth at which each ray meets each triangle, inf where it does not: height width face."""
+    """The depth at which each ray meets each triangle, inf for none: height width face."""
     a, b, c = triangles.transpose(1, 0, 2)
     shape = (*near.shape[:2], len(triangles), 3)
     toward = np.broadcast_to(direction[:, :, None], shape)
@@ -36,7 +36,7 @@ def every_hit(triangles, near, direction):
 
 
 def away_from_edges(*ids):
-    """Pixels that share their ids with all their neighbours."""
+    """Pixels whose neighbours all have the same id."""
     same = np.ones(ids[0].shape, bool)
     for image in map(np.asarray, ids):
         same[1:] &= image[1:] == image[:-1]
@@ -173,7 +173,7 @@ def test_buffer_is_float32_and_empty_where_nothing_is(camera, backend):
 
 
 def test_normals_are_unit_and_face_the_camera(camera, backend, rays):
-    """Seen from outside and from inside, with normals that point either way."""
+    """From outside and from inside, with normals that point to either side."""
     _, direction = rays(camera, HEIGHT, WIDTH)
     for radius in (1.5, 40):
         for sign in (1, -1):
@@ -203,7 +203,7 @@ def test_far_tiny_and_huge_scenes(backend, offset, scale):
 
 
 def test_only_what_is_in_front_is_seen(straight, backend):
-    """A quad behind the camera hides nothing; one through the eye's plane shows its front."""
+    """A quad behind the eye hides nothing; of one through the eye, the part in front shows."""
     content = trimesh.Scene()
     for z in (5, 0):
         quad = [[0, 0, z], [4, 0, z], [4, 4, z], [0, 4, z]]

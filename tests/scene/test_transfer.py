@@ -1,4 +1,4 @@
-"""Light from surface to surface against closed forms: a ball, parallel squares, a wall."""
+"""One bounce of light against closed forms: a ball, parallel squares, a wall."""
 
 import inspect
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def square(z, facing, side=1.0):
-    """A square across the z axis whose front faces `facing` (1 or -1) along it."""
+    """A square normal to the z axis; its front faces +z (`facing` 1) or -z (-1)."""
     half = side / 2
     corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -31,7 +31,7 @@ def built(meshes, camera, size=(12, 12), **options):
 
 
 def middle():
-    """Halfway between squares at 0 and 1: it sees all of the one at 1 and no more."""
+    """Halfway between squares at z = 0 and 1, only the one at 1 is visible."""
     pose = np.eye(4)
     pose[2, 3] = 0.5
     return OrthographicCamera(12.0, [6, 6], pose)
@@ -47,7 +47,7 @@ def ball():
 
 @pytest.mark.full
 def test_an_enclosure_gets_what_it_sends(ball):
-    """In a sphere every share is the point's part of the surface, wherever the pixel is."""
+    """In a sphere a sample's transfer is its fraction of the surface, for any pixel."""
     shares = np.asarray(ball.receive @ ball.send)
     np.testing.assert_allclose(shares.sum(axis=-1), 1, atol=0.03)
     np.testing.assert_allclose(np.asarray(ball.position) ** 2 @ np.ones(3), 4, rtol=0.02)
@@ -69,7 +69,7 @@ def test_singular_vectors_are_orthonormal_and_the_largest_come_first(ball):
 
 
 def test_parallel_squares_have_their_form_factor():
-    """0.19982 at a distance of one side (Hottel 1931); from the one side only."""
+    """0.19982 at a distance of one side (Hottel 1931), from the front only."""
     send, get = square(0, 1), square(1, -1)
     transfer = built([send, get], middle(), point_count=256, rank=64)[2]
     share = np.asarray(transfer.receive) @ np.asarray(transfer.send).sum(axis=1)

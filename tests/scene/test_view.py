@@ -1,4 +1,4 @@
-"""Cameras and lights that are given where none is asked for."""
+"""The default camera and lights of a scene."""
 
 import jax
 import jax.numpy as jnp

@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from jaxfx._extras import MissingExtraError, needs
-from jaxfx.io.color import jpeg_values
+from jaxfx.io.color import JPEG, PNG, jpeg_values
 from jaxfx.io.png import png_values
 from jaxfx.scene._part import UnreadableError
 
 
 _Texture = UInt8[np.ndarray, "height width 3"] | UInt16[np.ndarray, "height width 3"]
-# The first bytes of PNG and JPEG files, and of those that Pillow decodes.
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+# The first bytes of files that Pillow decodes.
 _OTHERS = {b"BM": "BMP", b"II*\0": "TIFF", b"MM\0*": "TIFF", b"RIFF": "WEBP", b"GIF8": "GIF"}
 
 
@@ -72,10 +71,10 @@ def read_image(data: bytes, name: str) -> _Texture:
 
 def _colors(data: bytes, name: str) -> _Texture:
     """As `read_image`, with whatever error the decoder raises."""
-    if data.startswith(_PNG):
+    if data.startswith(PNG):
         values = png_values(data)
         dtype = np.dtype(np.uint16 if data[24] == 16 else np.uint8)
-    elif data.startswith(_JPEG):
+    elif data.startswith(JPEG):
         values, dtype = jpeg_values(data), np.dtype(np.uint8)
     else:
         return _decode_with_pillow(data, name)

@@ -85,8 +85,8 @@ class Library:
             has_highlight = has_highlight and illumination not in (0, 1)
         exponent = 0.0
         if "ns" in record:
-            given = max(_numbers(record["ns"], "Ns", 1, 1)[0], 0.0)
-            exponent = given if has_highlight else 0.0
+            stated = max(_numbers(record["ns"], "Ns", 1, 1)[0], 0.0)
+            exponent = stated if has_highlight else 0.0
         return Material(
             color=color,
             texture=texture,

@@ -67,24 +67,28 @@ class _Text:
         self.at = 0
 
     def take(self, kind: str, count: int) -> np.ndarray:
-        found = self.numbers[self.at : self.at + count]
+        """The next `count` numbers, of NumPy's type `kind`."""
+        numbers = self.numbers[self.at : self.at + count]
         self.at += count
-        return self._typed(found, kind, count)
+        return self._typed(numbers, kind, count)
 
     def block(self, kinds: list[str], count: int) -> list[np.ndarray]:
-        found = self.take("f8", count * len(kinds)).reshape(count, len(kinds))
-        return [self._typed(found[:, i], kind, count) for i, kind in enumerate(kinds)]
+        """The columns of the next `count` rows, which have one number of each of `kinds`."""
+        numbers = self.take("f8", count * len(kinds)).reshape(count, len(kinds))
+        return [self._typed(numbers[:, i], kind, count) for i, kind in enumerate(kinds)]
 
-    def _typed(self, found: np.ndarray, kind: str, count: int) -> np.ndarray:
-        if len(found) < count:
+    def _typed(self, numbers: np.ndarray, kind: str, count: int) -> np.ndarray:
+        """`count` numbers in a type that holds them exactly; `UnreadableError` otherwise."""
+        if len(numbers) < count:
             raise UnreadableError("it ends early")
         with np.errstate(invalid="ignore"):
-            typed = found.astype(kind)
-        if kind[0] != "f" and not np.array_equal(typed, found):
+            typed = numbers.astype(kind)
+        if kind[0] != "f" and not np.array_equal(typed, numbers):
             raise UnreadableError(f"a number is no {np.dtype(kind)}")
         return typed
 
     def require_end(self) -> None:
+        """Raise `UnreadableError` where numbers are left."""
         if self.at < len(self.numbers):
             raise UnreadableError(f"{len(self.numbers) - self.at} numbers are left over")
 
@@ -96,21 +100,25 @@ class _Binary:
         self.data, self.order, self.at = data, order, 0
 
     def take(self, kind: str, count: int) -> np.ndarray:
+        """As `_Text.take`."""
         return self._read(np.dtype(self.order + kind), count)
 
     def block(self, kinds: list[str], count: int) -> list[np.ndarray]:
+        """As `_Text.block`."""
         row = np.dtype([(f"{i}", self.order + kind) for i, kind in enumerate(kinds)])
-        found = self._read(row, count)
-        return [found[name] for name in row.names or ()]
+        rows = self._read(row, count)
+        return [rows[name] for name in row.names or ()]
 
     def _read(self, dtype: np.dtype, count: int) -> np.ndarray:
+        """The next `count` items of a type."""
         if count < 0 or self.at + count * dtype.itemsize > len(self.data):
             raise UnreadableError("it ends early")
-        found = np.frombuffer(self.data, dtype, count, self.at)
-        self.at += found.nbytes
-        return found
+        items = np.frombuffer(self.data, dtype, count, self.at)
+        self.at += items.nbytes
+        return items
 
     def require_end(self) -> None:
+        """Raise `UnreadableError` where bytes other than blanks are left."""
         if self.data[self.at :].strip():
             raise UnreadableError(f"{len(self.data) - self.at} bytes are left over")
 

@@ -1,4 +1,4 @@
-"""Meshes of trimesh: what is read of them, and that nothing else about them matters."""
+"""Meshes of trimesh: what is read, and that their caches change nothing."""
 
 import bz2
 
@@ -15,7 +15,7 @@ def box():
 
 
 def used(mesh):
-    """A mesh that was asked for all that trimesh works out and keeps."""
+    """A mesh after all properties that trimesh computes and caches were read."""
     for name in ("vertex_normals", "face_normals", "face_angles", "visual"):
         getattr(mesh, name)
     mesh.visual.vertex_colors, mesh.visual.face_colors  # noqa: B018

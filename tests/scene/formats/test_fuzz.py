@@ -1,4 +1,4 @@
-"""Damaged glTF, OBJ and PLY files: an error that names them, or what another reader reads."""
+"""Damaged glTF, OBJ and PLY files: an error, or an independent reader's mesh."""
 
 import base64
 import itertools
@@ -14,7 +14,7 @@ COUNT = 300
 
 
 def normalized(triangles):
-    """Triangles in an order of their own: each from its least corner, then all sorted."""
+    """Triangles in canonical order: each from its smallest corner, then all sorted."""
     turned = []
     for triangle in np.round(np.asarray(triangles, float), 4).tolist():
         first = min(range(3), key=lambda i: triangle[i:] + triangle[:i])
@@ -35,7 +35,7 @@ def check(path, read):
     return 0
 
 
-# Another reader of glTF: recursive, index by index, with nothing but what these files use.
+# An independent reader of glTF, recursive and index by index, for what these files use.
 
 FORMATS = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4", 5120: "<i1", 5122: "<i2"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -138,7 +138,7 @@ def gltf_triangles(path):
 
 
 def gltf_document():
-    """Two meshes below turned nodes: a list of quantized, sparse rows, a strip and a fan."""
+    """Two meshes at rotated nodes: a list of quantized, sparse rows, a strip and a fan."""
     random = np.random.default_rng(5)
     doc = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 3]}]}
     binary, views, accessors = b"", [], []
@@ -226,7 +226,7 @@ def test_damaged_gltf(tmp_path):
     assert COUNT / 3 < raised < COUNT
 
 
-# Another reader of OBJ: every statement as a row, polygons that are convex as fans.
+# An independent reader of OBJ, for convex polygons.
 
 
 def obj_triangles(path):
@@ -295,7 +295,7 @@ def test_damaged_obj(tmp_path):
     assert COUNT / 5 < raised < COUNT
 
 
-# Another reader of PLY in letters: word by word, each element as its header says.
+# An independent reader of text PLY, word by word.
 
 
 def ply_triangles(path):

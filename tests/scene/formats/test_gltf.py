@@ -1,4 +1,4 @@
-"""glTF: what the standard allows, against its formulas written out."""
+"""glTF: features of the standard, against its formulas written out."""
 
 import json
 import logging
@@ -97,7 +97,7 @@ def test_points_and_lines_are_left_out_and_said_so(gltf, caplog):
 
 
 def rotation(axis, angle):
-    """Its matrix and its quaternion, by SciPy."""
+    """A rotation as matrix and quaternion, by SciPy."""
     turn = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis))
     return turn.as_matrix(), turn.as_quat().tolist()
 
@@ -117,7 +117,7 @@ def test_nodes_below_nodes(gltf):
     expected = expected * [1, 2, 3] @ turn.T + [5, 6, 7]
     np.testing.assert_allclose(loaded.vertices, expected, rtol=1e-12, atol=1e-12)
     assert loaded.names == ("leaf",)
-    # The determinant is negative: the order of the corners is turned round.
+    # The determinant is negative: the order of the corners is reversed.
     np.testing.assert_allclose(triangles(loaded)[0], expected[[0, 2, 1]], atol=1e-12)
 
 
@@ -207,7 +207,7 @@ def extended(**transform):
 
 
 def test_texture_transform_against_its_matrices(gltf, uv, texels, straight):
-    """The extension's three matrices, multiplied as its text has them, texel by texel."""
+    """The product of the extension's three matrices, texel by texel."""
     offset, angle, scale = [0.3, -0.2], 0.5, [0.8, 1.7]
     info = extended(offset=offset, rotation=angle, scale=scale)
     sampler = {"magFilter": 9728}
@@ -228,7 +228,7 @@ def test_texture_transform_against_its_matrices(gltf, uv, texels, straight):
 
 
 def test_each_texture_has_its_own_coordinates(gltf, uv, texels, codes):
-    """Set 1 for the colours, set 3, moved, for roughness and metal."""
+    """Set 1 for colour; set 3, transformed, for roughness and metallic."""
     mirrored = uv * [-1, 1] + [1, 0]
     places = {"TEXCOORD_1": gltf.accessor(uv), "TEXCOORD_3": gltf.accessor(mirrored)}
     material = gltf.material("texels.png", texCoord=1)
@@ -297,7 +297,7 @@ def test_webp_images(gltf, uv, texels, codes):
 
 
 def test_16_bits_of_a_normal_map_and_its_scale(gltf, uv, straight):
-    """A code that 8 bits do not have, bent half as far."""
+    """A 16-bit code between two 8-bit ones, with a scale of one half."""
     code = 40000
     Image.fromarray(np.full((2, 2), code, np.uint16)).save(gltf.folder / "bump.png")
     material = gltf.material("bump.png")

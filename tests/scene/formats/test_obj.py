@@ -1,4 +1,4 @@
-"""OBJ and MTL: indices, polygons, names and options, against what their text says."""
+"""OBJ and MTL: indices, polygons, names and options, against the files' text."""
 
 import logging
 
@@ -16,7 +16,7 @@ FACE = "usemtl a\nf 1/1 2/2 3/3 4/4\n"
 
 @pytest.fixture
 def load(tmp_path):
-    """Read an OBJ file of this text, beside `m.mtl` of that."""
+    """A function that loads an OBJ file with a text, beside an `m.mtl` with another."""
 
     def read(text, mtl="newmtl a\nKd 1 1 1\nmap_Kd texels.png\n"):
         (tmp_path / "m.mtl").write_text(mtl)
@@ -74,7 +74,7 @@ def test_concave_polygons_are_cut_by_ears(load):
 
 
 def test_faces_with_and_without_coordinates_and_normals(load, texels, codes, caplog):
-    """Each face has what it has: those without vt have the material's colour."""
+    """Faces with vt have the texture; those without have the material's colour."""
     half = "v 1.5 0 0\nv 1.5 2 0\nvt 0.5 0\nvt 0.5 1\nvn 0 1 1\n"
     faces = "usemtl a\nf 1/1 5/5 6/6 4/4\nf 5//1 2//1 3//1 6//1\n"
     with caplog.at_level(logging.WARNING, "jaxfx"):

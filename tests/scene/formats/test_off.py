@@ -1,4 +1,4 @@
-"""OFF: polygons, colours by how they are written, normals, and what is refused."""
+"""OFF: polygons, colours in both notations, normals, and refused files."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from jaxfx import io, scene
 
 @pytest.fixture
 def load(tmp_path):
-    """Read an OFF file of this text."""
+    """A function that loads an OFF file with a text."""
 
     def read(text):
         (tmp_path / "a.off").write_text(text)

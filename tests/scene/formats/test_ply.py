@@ -1,4 +1,4 @@
-"""PLY: types of colours, polygons, byte orders and texture coordinates."""
+"""PLY: colour types, polygons, byte orders and texture coordinates."""
 
 import numpy as np
 import pytest

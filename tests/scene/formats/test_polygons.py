@@ -13,7 +13,7 @@ def shoelace(polygon):
 
 
 def cut(polygon, turn=None):
-    """The triangles' corners in the plane, and how many polygons cross themselves."""
+    """The triangles' corners in the plane, and how many polygons intersect themselves."""
     flat = np.asarray(polygon, float)
     points = np.pad(flat, ((0, 0), (0, 1))) @ (np.eye(3) if turn is None else turn)
     triangles, owner, crossing = triangulate(points, [len(points)])
