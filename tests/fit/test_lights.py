@@ -228,7 +228,7 @@ def test_suns_over_a_matt_hill_are_dependent_but_for_three():
 
 
 @pytest.mark.full
-def test_uncertainty_is_the_spread_over_draws_of_noise():
+def test_standard_errors_are_the_spread_over_draws_of_noise():
     reference = relight.render(cache(), CAMERA, SUNS)
     rng = np.random.default_rng(2)
     misses = []
