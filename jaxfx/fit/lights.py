@@ -98,10 +98,10 @@ class LightsFit(eqx.Module):
             return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
         if self.indistinct:
             groups = ["lights " + " and ".join(map(str, group)) for group in self.indistinct]
-            return f"The picture can't tell apart {'; '.join(groups)}."
+            return f"The image can't tell apart {'; '.join(groups)}."
         if self.untold:
             names = [f"the {name} of light {index}" for index, name in self.untold]
-            return f"The picture does not tell {', '.join(names)}."
+            return f"The image does not determine {', '.join(names)}."
         return ""
 
     @property

@@ -216,7 +216,7 @@ def test_a_solver_that_breaks_down_leaves_what_it_had():
 @pytest.mark.full
 def test_what_the_image_does_not_determine_has_a_large_error():
     fitted = quietly(*behind_the_focus(), throw=False)
-    assert not fitted.success and "do not tell aperture" in fitted.doubt
+    assert not fitted.success and "do not determine aperture" in fitted.doubt
     assert fitted.untold == fit.PARAMETERS
     assert fitted.standard_errors["gamma"] == fitted.standard_errors["epsilon"] == np.inf
     # One plane has one circle of confusion: the aperture or the focus may have made it.
@@ -287,7 +287,7 @@ FAULTS = {
     "dof(tone=...)": {"tone": "gamma"},
     "dof(exposure=...)": {"exposure": 1.0},
     "dof(ratios=...) must name some": {"ratios": ("gamma",)},
-    "dof(lens) must be one for each of 2 pictures": {
+    "dof(lens) must be one for each of 2 photographs": {
         "reference": [np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3))]
     },
     "dof(reference[1]) must have the image's shape": {
