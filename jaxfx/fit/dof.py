@@ -53,10 +53,10 @@ class DofFit(eqx.Module):
     - `ends`: where the searches on small images ended, the best first: the parameters, in
       their units, and the `"loss"` of each.
     - `standard_errors`: by the name of each fitted parameter, in its unit; one for each
-      photograph where it differs between them. From a jackknife: the residuals of 8 x 8 tiles of the image
-      are taken for independent of one another, and no others. Of lenses, `scale` and `shift`,
-      the variance by strata of like circles of confusion is added, in which an effect errs
-      alike. A parameter that the images do not determine has a large one, or inf.
+      photograph where it differs between them. From a jackknife: the residuals of 8 x 8 tiles
+      of the image are taken for independent of one another, and no others. Of lenses, `scale`
+      and `shift`, the variance by strata of like circles of confusion is added, in which an
+      effect errs alike. A parameter that the images do not determine has a large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
       pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
