@@ -1,16 +1,16 @@
 """Every effect on whatever accelerator JAX finds, beside native CUDA and the CPU's values.
 
 `python -m benchmarks.devices --out devices.json` measures in under four minutes, prints a table
-and writes the same as JSON. Where JAX finds no accelerator it says so; `--cpu` then runs every
-row, as small as `--side` says, to see that they run.
+and writes the same as JSON. Without an accelerator it ends with a message, unless `--cpu` is
+given: then every row runs on the CPU, at the size of `--side`.
 
-Milliseconds are of a blocked wall clock: the median of at least five calls and their range.
-Compiling is told apart. `floor` is what a kernel would need at least: every input read once and
+Milliseconds are wall-clock times of blocked calls: the median of at least five and their range.
+Compilation is listed apart. `floor` is the least time of a kernel: every input read once and
 every output written once, at the card's bandwidth, or the arithmetic of all taps at its speed,
-whichever is longer; GB/s are those bytes over the time. `differs` is the share of the numbers
-that are further from the CPU's than a thousandth of the largest.
+whichever is longer; GB/s are those bytes over the time. `differs` is the share of values that
+differ from the CPU's by more than a thousandth of the largest.
 
-The native kernels of scatter are its sums alone, without what makes sprites of pixels.
+The native kernels of scatter are its sums alone: they are given sprites, not pixels.
 """
 
 import argparse
@@ -40,7 +40,7 @@ from jaxfx.dof.sprites import reach
 from jaxfx.fit._descent import _begin, _Objective, _step
 
 
-# Bytes and float32 operations a second, by what a card's name begins with.
+# Bytes and float32 operations per second, by the beginning of a card's name.
 CARDS = {
     "NVIDIA H200": (4.8e12, 60e12),
     "NVIDIA H100": (3.35e12, 60e12),
@@ -49,12 +49,12 @@ CARDS = {
 }
 # Operations of one tap of scatter, over its four planes.
 TAP = 20
-# No row is begun later than this.
+# Seconds after which no further row is started.
 SECONDS = 225.0
 
 
 class Row(NamedTuple):
-    """An effect as a function of arrays; and the arithmetic that no kernel of it can save."""
+    """An effect as a function of arrays, its data, and the operations that any kernel needs."""
 
     function: Callable[..., Any]
     data: tuple[Any, ...]
@@ -68,7 +68,7 @@ def squared(function):
 
 
 def depth_of_field(side):
-    """Scatter and its relatives, of two discs before a wall."""
+    """The methods of depth of field, on two discs before a wall."""
     rows = {}
     for radius in (8, 32):
         data, room = _discs(side, radius), 2.0 * radius
@@ -92,7 +92,7 @@ def depth_of_field(side):
 
 
 def wide(side):
-    """A picture of 1920 x 1080, at a radius of 16."""
+    """An image of 1920 x 1080, at a radius of 16."""
     height, width = 1080 * side // 512, 1920 * side // 512
     image, depth, lens = two_discs(max(height, width), 16)
     scatter = lambda *data: dof.scatter(*data, gamma=2.0, max_coc=32.0)
@@ -109,7 +109,7 @@ def wide(side):
 
 
 def reprojection(side):
-    """A relief seen from the side, from one picture and from eight."""
+    """A relief from the side, from one image and from eight."""
     images, depths, cameras = map(
         list, zip(*(_view(side, 0.1 * k) for k in range(8)), strict=True)
     )
@@ -155,7 +155,7 @@ def lighting(side):
 
 
 class Misfit(eqx.Module):
-    """How far a picture by scatter is from another one, as a function of the lens."""
+    """The difference between an image by scatter and another one, as a function of the lens."""
 
     reference: Float[Array, "height width channel"]
     image: Float[Array, "height width channel"]

@@ -1,9 +1,9 @@
 """Errors, stated errors and seconds of `fit.dof`, for `docs/fits.md`.
 
-`python -m benchmarks.fit_lens [MESH ...]` fits multi-pass pictures of 320 x 240 pixels of every
+`python -m benchmarks.fit_lens [MESH ...]` fits multi-pass images of 320 x 240 pixels of every
 scene, the still life if none is given, at three foci and two apertures, from starts that are
-30 % (aperture) and 15 % (focus) off, either way. A row holds medians, the worst in brackets,
-of a method; `--each` prints every fit.
+30 % (aperture) and 15 % (focus) off, in both directions. A row holds the medians of a method,
+the worst in brackets; `--each` prints every fit.
 """
 
 import argparse
@@ -29,7 +29,7 @@ METHODS = {
 
 
 def fits(case, name, options):
-    """Of every focus, aperture and start: the case, misses and errors as ratios, seconds."""
+    """For every focus, aperture and start: name, errors, stated errors (ratios), seconds."""
     if name.endswith("second layer"):
         options = options | {"behind": case.behind}
     for (place, share), largest in itertools.product(FOCI.items(), LARGEST):
@@ -39,13 +39,13 @@ def fits(case, name, options):
                 lens.aperture * aperture, lens.focus_distance * focus, lens.focal_pixels
             )
             begin = time.perf_counter()
-            given = reference, case.image, case.depth, start
-            found = jax.block_until_ready(fit.dof(*given, throw=False, **options))
+            data = reference, case.image, case.depth, start
+            fitted = jax.block_until_ready(fit.dof(*data, throw=False, **options))
             took = time.perf_counter() - begin
-            truth = np.array([float(getattr(lens, each)) for each in FREE])
-            miss = np.array([float(getattr(found.lens, each)) for each in FREE]) / truth - 1
-            stated = np.array([float(found.standard_errors[each]) for each in FREE]) / truth
-            yield f"{place}, {largest} pixels", miss, stated, took, found.success
+            truth = np.array([float(getattr(lens, name)) for name in FREE])
+            error = np.array([float(getattr(fitted.lens, name)) for name in FREE]) / truth - 1
+            stated = np.array([float(fitted.standard_errors[name]) for name in FREE]) / truth
+            yield f"{place}, {largest} pixels", error, stated, took, fitted.success
 
 
 def main():
@@ -58,7 +58,10 @@ def main():
     paths = given.meshes or [None]
     meshes = [scene.still_life() if path is None else scene.load(path) for path in paths]
     cases = [Case(mesh, SIZE, given.samples) for mesh in meshes]
-    print("| method | aperture off, % | focus off, % | stated, % | within 1.96 | s | success |")
+    print(
+        "| method | error of aperture, % | error of focus, % | stated, % | within 1.96 | s "
+        "| success |"
+    )
     print("|---|---:|---:|---:|---:|---:|---:|")
     for name in given.methods:
         rows = []
@@ -66,21 +69,21 @@ def main():
             for place, *row in fits(case, name, METHODS[name]):
                 rows.append(row)
                 if given.each:
-                    miss, stated, took, success = row
+                    error, stated, took, success = row
                     print(
                         name,
                         path or "still life",
                         place,
-                        100 * miss,
+                        100 * error,
                         100 * stated,
                         took,
                         success,
                     )
-        miss, stated, took, success = (np.array(column) for column in zip(*rows, strict=True))
-        off = 100 * np.abs(miss)
-        shown = [f"{np.median(off[:, i]):.1f} ({off[:, i].max():.1f})" for i in range(2)]
+        error, stated, took, success = (np.array(column) for column in zip(*rows, strict=True))
+        size = 100 * np.abs(error)
+        shown = [f"{np.median(size[:, i]):.1f} ({size[:, i].max():.1f})" for i in range(2)]
         errors = ", ".join(f"{100 * np.median(stated[:, i]):.1f}" for i in range(2))
-        held = (np.abs(miss) < 1.96 * stated).mean(axis=0)
+        held = (np.abs(error) < 1.96 * stated).mean(axis=0)
         print(
             f"| {name} | {shown[0]} | {shown[1]} | {errors} | "
             f"{100 * held[0]:.0f} %, {100 * held[1]:.0f} % | "

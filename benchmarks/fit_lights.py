@@ -1,7 +1,8 @@
 """Truth, result, stated error, ratio and seconds of `fit.lights`, for `docs/fits.md`.
 
-`python -m benchmarks.fit_lights` prints it: the pictures of `tests/cases/lit.py`, a sun and a
-lamp in each, as they are and spoilt. Seconds are those of a second call, the median of five.
+`python -m benchmarks.fit_lights` prints it: the images of `tests/cases/lit.py`, a sun and a
+lamp in each, clean, with noise, clipped, and with shadows that the model lacks. Seconds are
+those of a second call, the median of five.
 """
 
 import time
@@ -14,7 +15,7 @@ from tests.cases import lit
 
 
 def scenes(seed):
-    """Pictures of one pair of lights, and the lights with their start."""
+    """For one pair of lights: names of images, the images, the lights and their start."""
     clean, truth, start = lit.problem(seed, spheres=0, noise=0)
     yield "clean", clean, truth, start
     yield "noise of 3 %", lit.problem(seed, spheres=0, noise=0.03)[0], truth, start
@@ -46,7 +47,7 @@ def shown(numbers):
 
 def main():
     jax.config.update("jax_enable_x64", True)
-    print("| picture | parameter | truth | found | stated error | off / stated | success | s |")
+    print("| image | parameter | truth | found | stated error | error / stated | success | s |")
     print("|---|---|---|---|---|---|---|---:|")
     for name, image, truth, start in scenes(0):
         result, took = found(name, image, start), seconds(name, image, start)

@@ -1,4 +1,4 @@
-"""How an example begins, and how it ends where it can't go on."""
+"""The output folder of an example, and the message with which it ends on an error."""
 
 import sys
 import tempfile
@@ -7,11 +7,12 @@ from typing import NoReturn
 
 
 def fail(message: object) -> NoReturn:
+    """End the program with an error message."""
     sys.exit(f"{Path(sys.argv[0]).name}: error: {message}")
 
 
 def make_folder(folder: Path) -> Path:
-    """The folder, made if need be; said now rather than after the work."""
+    """The folder, created if need be; an error is reported before the work, not after it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

@@ -1,4 +1,4 @@
-"""What `pipeline.py` needs but does not show: its search, its measures, its panels."""
+"""Helpers of `pipeline.py`: arguments, timing, Levenberg-Marquardt and figures."""
 
 import argparse
 import statistics
@@ -20,14 +20,14 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-# What is said of the standard errors.
+# The note printed below the standard errors.
 IF_NOISE = """\
 if noise: the standard errors, if all that is left were noise. They are too small: derivatives
 miss silhouettes, and the model misses what the mesh alone has (--of-mesh)"""
 
 
 def parsed(parser: argparse.ArgumentParser, least: Mapping[str, float]) -> Any:
-    """The arguments, no number of them below what is the least."""
+    """The parsed arguments; an error for a number below its entry in `least`."""
     arguments = parser.parse_args()
     for name, bound in least.items():
         if not (value := getattr(arguments, name)) >= bound:
@@ -36,7 +36,7 @@ def parsed(parser: argparse.ArgumentParser, least: Mapping[str, float]) -> Any:
 
 
 def timed(name: str, call: Callable[[], Any], given: dict[str, Any]) -> float:
-    """The median milliseconds of five calls after the first, printed; what it gave is kept."""
+    """Median milliseconds of five calls after the first, printed; `given` keeps the result."""
     given[name], times = jax.block_until_ready(call()), [time.perf_counter()]
     for _ in range(5):
         jax.block_until_ready(call())
@@ -47,14 +47,14 @@ def timed(name: str, call: Callable[[], Any], given: dict[str, Any]) -> float:
 
 
 def equations(image, jacobian) -> tuple[float, np.ndarray, np.ndarray]:
-    """The mean square of the residual, half of its gradient, and J^T J."""
+    """The mean square of the residual, half of its gradient, and J^T J over its size."""
     rows = np.concatenate([jacobian, np.asarray(image)[..., None]], axis=-1, dtype=float)
     squares = np.einsum("yxci,yxcj->ij", rows, rows, optimize=True) / np.size(image)
     return squares[-1, -1], squares[-1, :-1], squares[:-1, :-1]
 
 
 def descend(model: Callable, numbers: np.ndarray, free: int, steps: int):
-    """Levenberg-Marquardt in the first `free` numbers, each damped by its own column's size."""
+    """Levenberg-Marquardt in the first `free` numbers, each damped by its column's size."""
     damping, taken, (loss, slope, squares) = 1e-2, 0, model(numbers)
     while taken < steps:
         taken, move = taken + 1, np.zeros_like(numbers)
@@ -79,18 +79,18 @@ def print_table(columns: Mapping[str, Mapping[str, float]]) -> None:
 
 
 def shown(linear) -> np.ndarray:
-    """A picture as a screen has it."""
+    """An image in sRGB, for a screen."""
     return np.asarray(io.srgb_from_linear(np.clip(np.asarray(linear), 0, 1)))
 
 
 def gray(difference, span: float | None = None) -> np.ndarray:
-    """Gray where nothing changes, black to white over `span`; by default, of nearly all."""
+    """Gray where nothing changes, black to white over `span`; by default 99 % of values fit."""
     span = span or max(2 * np.percentile(np.abs(difference), 99), 1e-12)
     return np.clip(0.5 + np.asarray(difference) / span, 0, 1)
 
 
 def write_panels(path: Path, images: Mapping[str, np.ndarray]) -> None:
-    """Pictures in rows of three, each under its title."""
+    """Write images in rows of three, each under its title."""
     rows = -(-len(images) // 3)
     figure, axes = plt.subplots(rows, 3, figsize=(13.2, 3.6 * rows), layout="constrained")
     for ax in axes.flat:

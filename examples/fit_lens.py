@@ -1,8 +1,8 @@
 """From a mesh to a fitted lens.
 
-Renders a mesh with its depth, takes a multi-pass depth-of-field picture of it as the reference,
-and fits the lens and the amplifications of scatter depth of field to that reference by
-gradient, from a start that is wrong on purpose. Writes `reference.exr`, `fitted.exr`,
+Renders a mesh with its depth, renders it through a lens by many passes as the reference, and
+fits the lens, gamma and epsilon of `dof.scatter` to that reference, from a start that is wrong
+on purpose. Writes `reference.exr`, `fitted.exr`,
 `fit.png`, `chart.png` and `report.json`.
 """
 
@@ -29,11 +29,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-# The reference's lens: its largest circle of confusion, as a share of the picture's side.
+# The largest circle of confusion of the reference's lens, as a ratio to the image's side.
 LARGEST_COC = 0.04
-# Passes that antialias the pinhole picture.
+# Passes that antialias the pinhole image.
 PINHOLE_PASSES = 16
-# The lines of the chart.
+# The labels of the chart's lines.
 MULTI, WHOLE = "multi-pass", "pinhole passes, then scatter"
 REPROJECTED = "reprojected, passes"
 
@@ -43,7 +43,7 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
-    parser.add_argument("--size", type=int, default=320, help="side of the picture, pixels")
+    parser.add_argument("--size", type=int, default=320, help="side of the image, pixels")
     parser.add_argument("--samples", type=int, default=256, help="passes of the reference")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
     parser.add_argument("--seed", type=int, default=0, help="of the start and of the passes")
@@ -55,7 +55,7 @@ def parse() -> argparse.Namespace:
 
 
 def load(path: Path | None, size: int):
-    """The scene, its camera, lights and depth; a file that won't do ends the program."""
+    """The scene, its camera, lights and depth; a file that can't be used ends the program."""
     try:
         mesh = scene.still_life() if path is None else scene.load(path)
         camera = scene.default_camera(mesh, height=size, width=size)
@@ -66,28 +66,28 @@ def load(path: Path | None, size: int):
 
 
 def lens_for(camera, depth) -> ThinLens:
-    """A lens focused on the nearer third of what is seen, open as wide as LARGEST_COC says."""
-    seen = depth[jnp.isfinite(depth)]
-    if jnp.max(seen) < 1.001 * jnp.min(seen):
+    """A lens focused at the first third of visible depths, as wide as LARGEST_COC asks."""
+    visible = depth[jnp.isfinite(depth)]
+    if jnp.max(visible) < 1.001 * jnp.min(visible):
         fail("all that is seen lies at one depth, nothing is blurred")
-    focus = jnp.quantile(seen, 1 / 3)
+    focus = jnp.quantile(visible, 1 / 3)
     unit = ThinLens.from_camera(camera, aperture=1.0, focus_distance=focus)
-    largest = jnp.max(unit.circle_of_confusion(seen))
+    largest = jnp.max(unit.circle_of_confusion(visible))
     aperture = LARGEST_COC * min(depth.shape) / largest
     return ThinLens(aperture, unit.focus_distance, unit.focal_pixels)
 
 
 def without_holes(depth):
-    """The depth, with the farthest that is seen where there is nothing.
+    """The depth, with the farthest visible one in place of the background.
 
-    Nothing is infinitely far, and its circles of confusion larger than any other: scatter,
-    which knows no occlusion, would spread its black over all that is out of focus before it.
+    The circles of confusion of a depth of inf are larger than any other: scatter, which has no
+    occlusion, would spread the black of the background over all that is out of focus.
     """
     return jnp.minimum(depth, jnp.max(jnp.where(jnp.isfinite(depth), depth, 0)))
 
 
 def wrong_start(lens: ThinLens, seed: int) -> dict:
-    """A lens 40 % and 15 % off, gamma and epsilon anywhere: which way, the seed decides."""
+    """A lens 40 % and 15 % off, gamma and epsilon by 2.5; the seed decides the directions."""
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], 4)
     return {
         "lens": ThinLens(
@@ -106,7 +106,7 @@ def numbers(lens: ThinLens, **amplifications) -> dict[str, float]:
 
 
 def near_edges(depth, radius: int):
-    """The pixels within a radius of a jump in depth by a twentieth; None for no pixel."""
+    """The pixels within a radius of a jump in depth of 5 %; None if there is none."""
 
     def largest(x, side):
         return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (side, side), (1, 1), "SAME")
@@ -119,10 +119,10 @@ def near_edges(depth, radius: int):
 
 def contenders(multi_pass, pinhole, reprojected, scatter, layered, image, samples: int) -> dict:
     """The methods of the chart; the first three take a count of passes."""
-    # Of a compiled method every call counts the same.
+    # Compile first: every timed call then takes the same time.
     jax.block_until_ready((scatter(image), layered(image), reprojected(1)))
     counts = [*(2**k for k in range(2, math.ceil(math.log2(samples)))), samples]
-    # Scatter's picture has its price too, which grows with its antialiasing.
+    # The image that scatter is given has its price too, which grows with its antialiasing.
     return (
         {
             "scatter of a given picture": lambda: scatter(image),
@@ -178,15 +178,15 @@ def print_table(report: dict) -> None:
     print(f"{'PSNR (dB)':28}{report['psnr_start']:12.2f}{report['psnr_fitted']:12.2f}")
     print(f"{'pinhole (dB)':28}{report['psnr_pinhole']:12.2f}")
     if not report["converged"]:
-        print("The search ended before it converged; what it had reached is shown.")
+        print("The search ended before it converged; its last values are shown.")
 
 
 def strict(value):
-    """The value as JSON has it: null for what is not finite."""
+    """The value for JSON, which has null in place of numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: strict(each) for key, each in value.items()}
+        return {key: strict(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [strict(each) for each in value]
+        return [strict(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -210,7 +210,7 @@ def main() -> None:
         options = {"samples": count, "seed": seed, "progress": progress}
         return dof.accumulate(render, camera, eye, **options)
 
-    # A lens of no aperture: a pinhole picture, antialiased as the reference is.
+    # A lens of no aperture: a pinhole image, antialiased as the reference is.
     image = accumulate(0.0, PINHOLE_PASSES, seed).image
     reference = accumulate(lens.aperture, samples, seed, progress=True)
     exr.write(out / "reference.exr", {"": reference.image, "depth": depth})
@@ -247,21 +247,21 @@ def main() -> None:
             image, filled, fitted.lens, gamma=fitted.gamma, epsilon=fitted.epsilon
         )
 
-    # Seen again from all over the lens, by the picture and its depth alone.
+    # New views from points of the lens, from the image and its depth alone.
     @jax.jit
-    def seen_again(eye):
+    def view_from(eye):
         return jnp.dstack(reproject.warp(image, filled, camera, eye))
 
     def reprojected(count):
         options = {"samples": count, "jitter": False, "progress": False}
         *color, alpha = jnp.moveaxis(
-            dof.accumulate(seen_again, camera, lens, **options).image, -1, 0
+            dof.accumulate(view_from, camera, lens, **options).image, -1, 0
         )
         return jnp.stack(color, axis=-1) / jnp.maximum(alpha[..., None], 1 / count)
 
     coc = float(jnp.max(fitted.lens.circle_of_confusion(filled)))
     methods = contenders(
-        # Of another seed than the reference's, which would count its own passes as its truth.
+        # Another seed than the reference's: with its own passes the error would be too small.
         lambda count: accumulate(lens.aperture, count, seed + 1).image,
         lambda count: accumulate(0.0, count, seed + 1).image,
         reprojected,
@@ -271,7 +271,7 @@ def main() -> None:
         samples,
     )
     edges = near_edges(depth, math.ceil(coc / 2))
-    # Their memory would be that of one program for all passes, which nobody compiles.
+    # Their memory would be that of one program for all passes, which is never compiled.
     measurements = tradeoff.measure(
         methods, reference.image, mask=edges, memory=False, progress=True
     )

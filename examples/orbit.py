@@ -1,9 +1,9 @@
-"""One picture with its depth, seen from around.
+"""Views around a scene from one image with its depth.
 
-Renders a mesh, or takes a picture and its depth from an EXR file, and turns the camera about
-the median depth of what it shows, by reprojecting that single picture. What it did not see, and
-what passes behind something near, is hatched. Writes `orbit.gif` and `orbit.png`, a contact
-sheet with the turned views and, for a mesh, the same views rendered anew.
+Renders a mesh, or reads an image and its depth from an EXR file, and turns the camera about the
+median depth by reprojecting that single image. Holes, which the image does not show, are
+hatched. Writes `orbit.gif` and `orbit.png`, a contact sheet with the turned views and, for a
+mesh, the same views rendered from it.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from jaxfx import PinholeCamera, exr, io, relight, reproject, scene
 from jaxfx._files import write_whole
 
 
-# Pictures on the contact sheet.
+# Images on the contact sheet.
 SHEET = 5
 
 
@@ -30,10 +30,8 @@ def parse() -> argparse.Namespace:
     )
     given = parser.add_mutually_exclusive_group()
     given.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
-    given.add_argument("--picture", type=Path, help="an EXR file with colour and `depth`")
-    parser.add_argument(
-        "--size", type=int, default=256, help="side of a mesh's picture, pixels"
-    )
+    given.add_argument("--picture", type=Path, help="an EXR file with color and `depth`")
+    parser.add_argument("--size", type=int, default=256, help="side of a mesh's image, pixels")
     parser.add_argument("--fov", type=float, default=45.0, help="of --picture, degrees")
     parser.add_argument("--degrees", type=float, default=6.0, help="to either side")
     parser.add_argument("--frames", type=int, default=24, help="of the GIF")
@@ -48,7 +46,7 @@ def parse() -> argparse.Namespace:
 
 
 def load(arguments: argparse.Namespace):
-    """The picture, its depth, its camera and, for a mesh, how to render another view."""
+    """The image, its depth, its camera and, for a mesh, a function from camera to image."""
     try:
         if arguments.picture is not None:
             channels = exr.read(arguments.picture)
@@ -59,19 +57,19 @@ def load(arguments: argparse.Namespace):
         eye = scene.default_camera(mesh, height=arguments.size, width=arguments.size)
         lights = scene.default_lights(eye)
 
-        def taken(eye):
+        def rendered(eye):
             buffer = scene.gbuffer(mesh, eye, height=arguments.size, width=arguments.size)
             return relight.render(buffer, eye, lights), buffer.depth
 
-        return *taken(eye), eye, lambda eye: taken(eye)[0]
+        return *rendered(eye), eye, lambda eye: rendered(eye)[0]
     except KeyError as error:
-        fail(f"--picture must hold colour and `depth`, it lacks {error}")
+        fail(f"--picture must hold color and `depth`, it lacks {error}")
     except (OSError, ValueError, RuntimeError) as error:
         fail(error)
 
 
 def turned(eye: PinholeCamera, degrees: float, distance: float) -> PinholeCamera:
-    """The camera turned about a point of its axis, around the picture's vertical."""
+    """The camera turned about a point of its axis, around the image's vertical."""
     angle = np.deg2rad(degrees)
     c, s = np.cos(angle), np.sin(angle)
     turn = np.eye(4)
@@ -82,7 +80,7 @@ def turned(eye: PinholeCamera, degrees: float, distance: float) -> PinholeCamera
 
 
 def hatched(image, alpha) -> np.ndarray:
-    """The picture, with dark stripes where nothing is known."""
+    """The image, with dark stripes in holes."""
     stripes = np.add.outer(*map(np.arange, alpha.shape)) // 3 % 2 * 0.04 + 0.01
     return np.where(np.asarray(alpha)[..., None] > 0, image, stripes[..., None])
 
@@ -104,10 +102,10 @@ def main() -> None:
     arguments = parse()
     out = make_folder(arguments.out)
     image, depth, eye, render = load(arguments)
-    seen = np.asarray(depth)[np.isfinite(depth) & (np.asarray(depth) > 0)]
-    if not seen.size:
-        fail("the picture has no depth anywhere")
-    distance = float(np.median(seen))
+    known = np.asarray(depth)[np.isfinite(depth) & (np.asarray(depth) > 0)]
+    if not known.size:
+        fail("the image has no depth anywhere")
+    distance = float(np.median(known))
 
     view = jax.jit(lambda target: reproject.warp(image, depth, eye, target))
 

@@ -1,14 +1,14 @@
-"""From a mesh to a picture through every effect, and from a picture back to its parameters.
+"""From a mesh to an image through every effect, and from an image back to its parameters.
 
-A mesh is rendered into deep frame buffers by a few cameras. Then one compiled function makes a
-picture of them: the frame buffer of a new camera (`reproject.blend`, `relight.fill_holes`), a
-key light with its shadow, and depth of field (`dof.scatter`). It is differentiated end to end
-in 13 numbers: the camera's eye and turn, the key light's direction and color, the lens'
-aperture and focus distance. Levenberg-Marquardt finds all of them from a noisy picture that the
-same function made. From one of the mesh itself (`--of-mesh`), which is sharper than what is
-read between a frame buffer's pixels, it finds camera and light, and not the lens. Prints the
-time of every stage, what is left of the errors, and what noise alone would leave; writes
-`stages.png`, `derivatives.png`, `fit.png` and `report.json`.
+A mesh is rendered into G-buffers by a few cameras. Then one compiled function draws an image
+from them: the G-buffer of a new camera (`reproject.blend`, `relight.fill_holes`), a key light
+with its shadow, and depth of field (`dof.scatter`). It is differentiated end to end in 13
+numbers: the camera's position and rotation, the key light's direction and color, the lens'
+aperture and focus distance. Levenberg-Marquardt finds all of them from a noisy image that the
+same function drew. From an image of the mesh itself (`--of-mesh`), which is sharper than one
+interpolated between the pixels of G-buffers, it finds camera and light, but not the lens.
+Prints the time of every stage, the errors that are left, and those that noise alone would
+leave; writes `stages.png`, `derivatives.png`, `fit.png` and `report.json`.
 """
 
 import argparse
@@ -35,23 +35,25 @@ from jaxfx.lens import ThinLens
 from jaxfx.light import AmbientLight, DirectionalLight
 
 
-# Where the cameras of the frame buffers stand, from the scene's camera: right, down and
-# forward, in distances to the median depth; and how many times as wide their pictures are.
+# Where the cameras of the G-buffers stand, from the scene's camera: right, down and forward, as
+# ratios to the median depth; and how many times as wide their images are.
 CACHES = ((0.0, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.12, -0.05, 0.0))
 WIDER = 1.3
 AMBIENT = (0.2, 0.21, 0.24)
-# The largest circle of confusion of the target, as a share of the picture's height.
+# The largest circle of confusion of the target, as a ratio to the image's height.
 BLUR = 0.08
-# The depth of holes, in distances; a step in depth from pixel to pixel, of it, that is an edge.
+# The depth of holes, in median depths; and the step in depth between pixels, as a ratio to the
+# depth, from which on there is an edge.
 FAR, JUMP = 1e4, 0.05
-# The rounds of a search: the sigma of the residual's blur, as a share of the height, but no
-# less than a pixel; how many numbers are sought: of the lens smooth pictures tell least.
+# The rounds of a search: the sigma of the residual's blur, as a ratio to the height, but no
+# less than a pixel; and how many numbers are sought: the lens last, which blurred images show
+# least.
 ROUNDS = ((1 / 12, 11), (1 / 24, 11), (1 / 48, 13), (0.0, 13), (0.0, 13), (0.0, 13))
-# What is tried of the lens, before it is sought: changes of the logarithms of both numbers.
+# Lenses that are compared before the lens is sought: changes of the logarithms of both numbers.
 LENSES = [(a, n) for a in np.linspace(-0.5, 0.5, 5) for n in np.linspace(-0.36, 0.36, 7)]
 
 # The 13 numbers of the target, and by how much each start is off, up or down:
-# - the camera's move as a twist about its own axes, in distances and in radians;
+# - the camera's motion as a twist about its own axes, in median depths and in radians;
 # - the tilt of the light's direction to the right and down, as slopes, and its log color;
 # - the log of the lens' aperture, here that of BLUR, and the distance over the focus distance.
 NAMES = ("eye x", "eye y", "eye z", "turn x", "turn y", "turn z", "light x", "light y")
@@ -70,12 +72,12 @@ def parse() -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--scene", type=Path, help="a mesh; without it, a still life")
-    add("--height", type=int, default=120, help="of the picture, pixels; 4 : 3 wide")
+    add("--height", type=int, default=120, help="of the image, pixels; 4 : 3 wide")
     add("--map-size", type=int, default=256, help="side of the shadow map, texels")
     add("--starts", type=int, default=1, help="searches, each from another start")
     add("--steps", type=int, default=10, help="of Levenberg-Marquardt, in each of 6 rounds")
     add("--seed", type=int, default=0, help="of the first start and of the target's noise")
-    add("--of-mesh", action="store_true", help="the target is a picture of the mesh itself")
+    add("--of-mesh", action="store_true", help="the target is an image of the mesh itself")
     add("--noise", type=float, default=0.01, help="of the target, its standard deviation")
     add("--out", type=Path, default=Path("out"), help="folder to write to")
     least = {"height": 24, "map_size": 16, "starts": 1, "steps": 1, "seed": 0, "noise": 0}
@@ -83,7 +85,11 @@ def parse() -> argparse.Namespace:
 
 
 class Stage(eqx.Module):
-    """What the picture is made of beside its 13 numbers."""
+    """All that the image depends on beside its 13 numbers.
+
+    - `distance`: the median depth, in scene units.
+    - `softness`: that of the shadow, in scene units.
+    """
 
     caches: list[GBuffer]
     cameras: list[PinholeCamera]
@@ -112,9 +118,9 @@ class Stage(eqx.Module):
 
 @eqx.filter_jit
 def new_view(stage: Stage, camera: PinholeCamera) -> GBuffer:
-    """The frame buffer of another camera, from the caches: every channel is reprojected.
+    """The G-buffer of another camera, from the caches: every channel is reprojected.
 
-    So are the points of the world, which give the depth, in place of a color, never shaded.
+    In place of a color, which is not shaded, go the points of the world: they give the depth.
     """
     here = jax.lax.stop_gradient(camera)
     images = [channels(*pair) for pair in zip(stage.caches, stage.cameras, strict=True)]
@@ -126,7 +132,7 @@ def new_view(stage: Stage, camera: PinholeCamera) -> GBuffer:
         image[..., first : first + 3] for first in range(0, 18, 3)
     )
     shader = jnp.where(jnp.sum(kinds, axis=-1) > 0.5, jnp.argmax(kinds, axis=-1), -1)
-    # A hole lies beyond everything, until it is filled: then it is where its neighbor is.
+    # A hole lies beyond everything until it is filled with its neighbor.
     depth = jnp.where(alpha > 0, here.project(points)[1], FAR * stage.distance)
     surface = ambient, diffuse, specular, normal  # Shading makes them unit vectors.
     made = GBuffer(points, shader, *surface, depth=depth, roughness=image[..., 18])
@@ -135,7 +141,7 @@ def new_view(stage: Stage, camera: PinholeCamera) -> GBuffer:
 
 
 def channels(cache: GBuffer, camera: PinholeCamera) -> Float[Array, "height width 19"]:
-    """The world's points and all that shading reads, the shaders' numbers one by one."""
+    """Points of the world and all that shading reads, with a channel for each shader."""
     depth = jnp.where(jnp.isfinite(cache.depth), cache.depth, 1)
     points = camera.points(depth)
     kinds = jax.nn.one_hot(cache.shader, 3, dtype=depth.dtype)
@@ -144,16 +150,16 @@ def channels(cache: GBuffer, camera: PinholeCamera) -> Float[Array, "height widt
 
 
 def moving(made: GBuffer, camera: PinholeCamera) -> GBuffer:
-    """The same frame buffer, which moves when the camera does.
+    """The same G-buffer, with a derivative in the camera.
 
-    Each pixel moves with the point that it shows, by the picture's own slopes (Lucas & Kanade
-    1981). `blend` itself would give the derivative of where its rays hit, in which the few that
-    graze a surface outweigh all others. Missing here: what comes into sight, and where depth
-    jumps, how points move.
+    Each pixel moves with the point that it shows, by the slopes of the image (Lucas & Kanade
+    1981). `blend` itself has the derivative of where its rays hit, in which the few that graze
+    a surface outweigh all others. Missing here: what comes into sight, and the motion of points
+    at steps in depth.
     """
     points = made.color
     pixels, depth = camera.project(points)
-    step = jax.lax.stop_gradient(pixels) - pixels  # nothing, but for its derivative
+    step = jax.lax.stop_gradient(pixels) - pixels  # 0, with a derivative
 
     def moved(image, counts: Any = 1.0):
         down, across = jnp.gradient(image, axis=(0, 1))
@@ -169,7 +175,7 @@ def moving(made: GBuffer, camera: PinholeCamera) -> GBuffer:
 
 @eqx.filter_jit
 def relit(stage: Stage, gbuffer, camera, light: DirectionalLight, cast: Shadow) -> Image:
-    """The picture under the key light and its shadow, and the ambient light."""
+    """The image under the key light with its shadow, and the ambient light."""
     softness = stage.softness
     visible = shadow.MovingShadow(*cast, gbuffer, camera, softness=softness, size=5)(light)
     key = relight.shade(gbuffer, camera, light, visible)
@@ -182,7 +188,7 @@ def blurred(stage: Stage, image, depth, lens: ThinLens) -> Image:
 
 
 def picture(numbers: Numbers, stage: Stage, cast: Shadow) -> Image:
-    """Everything, from the parameters to the picture."""
+    """The whole pipeline, from the parameters to the image."""
     camera = stage.camera(numbers)
     gbuffer = new_view(stage, camera)
     image = relit(stage, gbuffer, camera, stage.light(numbers), cast)
@@ -193,7 +199,7 @@ draw = eqx.filter_jit(picture)
 
 
 def residual(numbers: Numbers, stage: Stage, cast: Shadow, target, sigma) -> Image:
-    """The picture less the target, under a Gaussian of so many pixels, round the edges."""
+    """The image less the target, blurred by a Gaussian of `sigma` pixels that wraps around."""
     down, across = (jnp.fft.fftfreq(n)[:, None] for n in stage.shape)
     low = jnp.exp(-2 * (jnp.pi * sigma) ** 2 * (down**2 + (across**2).T))
     difference = jnp.fft.fft2(picture(numbers, stage, cast) - target, axes=(0, 1))
@@ -215,7 +221,7 @@ def reverse(numbers: Numbers, *rest) -> Numbers:
 
 
 class Mesh(NamedTuple):
-    """The host's side: a mesh and the ball about what is seen of it."""
+    """A mesh, rendered on the host, and the ball about its visible part."""
 
     mesh: Any
     centre: np.ndarray
@@ -238,7 +244,7 @@ def floats(tree: Any) -> Any:
 
 
 def set_stage(path: Path | None, height: int, map_size: int) -> tuple[Mesh, Stage, np.ndarray]:
-    """The mesh, its frame buffers, and the numbers to find; a bad file ends the program."""
+    """The mesh, its G-buffers, and the numbers to find; a bad file ends the program."""
     shape = height, 4 * height // 3
     try:
         loaded = scene.still_life() if path is None else scene.load(path)
@@ -270,7 +276,7 @@ def set_stage(path: Path | None, height: int, map_size: int) -> tuple[Mesh, Stag
 
 
 def search(mesh: Mesh, stage: Stage, start: np.ndarray, target: Image, steps: int):
-    """What is found from coarse to fine, how it went, the covariance expected of its errors."""
+    """The numbers found from coarse to fine, figures of the search, covariance of errors."""
     begun, numbers, count, loss, squares = time.perf_counter(), start, 0, 0.0, np.eye(13)
     for index, (share, free) in enumerate(ROUNDS):
         sigma = jnp.asarray(max(share * stage.shape[0], 1.0))
@@ -287,15 +293,15 @@ def search(mesh: Mesh, stage: Stage, start: np.ndarray, target: Image, steps: in
 
 
 def best_lens(numbers: np.ndarray, target: Image, *rest) -> np.ndarray:
-    """Of near ones, the lens of the nearest picture: there may be a minimum on either side."""
+    """The numbers with the best lens of `LENSES`: there may be a minimum on either side."""
     changes = (np.r_[np.zeros(11), a, numbers[12] * np.expm1(n)] for a, n in LENSES)
     tried = [numbers + change for change in changes]
-    pictures = (draw(jnp.asarray(each, float), *rest) for each in tried)
-    return tried[np.argmin([float(jnp.mean((each - target) ** 2)) for each in pictures])]
+    images = (draw(jnp.asarray(point, float), *rest) for point in tried)
+    return tried[np.argmin([float(jnp.mean((image - target) ** 2)) for image in images])]
 
 
 def expected(covariance: np.ndarray) -> tuple[np.ndarray, str]:
-    """The standard errors, and which two numbers the picture tells apart worst."""
+    """The standard errors, and the two numbers that the image tells apart worst."""
     deviations = np.sqrt(np.diag(covariance))
     alike = np.abs(np.triu(covariance / np.outer(deviations, deviations), 1))
     one, other = np.unravel_index(np.argmax(alike), alike.shape)
@@ -303,12 +309,12 @@ def expected(covariance: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def sizes(away: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """How large errors are, in units that mean something."""
+    """The sizes of errors, in degrees and per cent."""
     percent = lambda logs: 100 * np.expm1(np.max(np.abs(logs)))
     values = {
         "eye, % of the distance": 100 * np.linalg.norm(away[:3]),
         "turn, degrees": np.degrees(np.linalg.norm(away[3:6])),
-        "light's way, degrees": np.degrees(np.linalg.norm(away[6:8])),
+        "light, degrees": np.degrees(np.linalg.norm(away[6:8])),
         "light's color, %": percent(away[8:11]),
         "aperture, %": percent(away[11]),
         "focus distance, %": 100 * abs(truth[12] / (truth[12] + away[12]) - 1),
@@ -317,7 +323,7 @@ def sizes(away: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 
 
 def times_of(numbers: Numbers, stage: Stage, cast: Shadow, target: Image) -> tuple[dict, dict]:
-    """The median milliseconds of every stage, compiled alone, and what each gives."""
+    """Median milliseconds of every stage, compiled alone, and the result of each."""
     given: dict[str, Any] = {}
     camera, light, lens = stage.camera(numbers), stage.light(numbers), stage.lens(numbers)
     rest = stage, cast, target, jnp.asarray(0.0)
@@ -340,7 +346,7 @@ def main() -> None:
     mesh, stage, truth = set_stage(arguments.scene, arguments.height, arguments.map_size)
     numbers = jnp.asarray(truth, float)
     camera, light, lens = stage.camera(numbers), stage.light(numbers), stage.lens(numbers)
-    # From the mesh itself, as the caches would have it if they missed nothing.
+    # From the mesh itself: the image of caches that miss nothing.
     cast, seen = mesh.cast(light), mesh.gbuffer(camera, stage.shape)
     from_mesh = blurred(stage, relit(stage, seen, camera, light, cast), seen.depth, lens)
     milliseconds, given = times_of(numbers, stage, cast, from_mesh)

@@ -1,7 +1,7 @@
 """Refocus a photograph or a rendering that has a depth for every pixel.
 
-Takes an image and its depth and gives each pixel the circle of confusion that a lens of the
-given aperture would have. Writes for every focus an image `focus_DEPTH.png`, with
+Takes an image and its depth, and spreads each pixel over the circle of confusion that a lens of
+the given aperture would have. Writes for every focus an image `focus_DEPTH.png`, with
 `focus_DEPTH.exr` beside it (linear light, the depth in use and the circles), and for all of
 them one figure, `refocus.png`.
 
@@ -12,9 +12,9 @@ them one figure, `refocus.png`.
     refocus.py left.png disp0.pfm --disparity --focal 3979 --baseline 0.193 --offset 124
     refocus.py color.exr distance.exr --ray --focal 800         along the ray, not the axis
 
-Files are known by what is in them, not by their names. Where the depth is missing (0, negative
-or NaN) it is filled as `jaxfx.depth.fill` says; inf, and the 1e10 and 65504 of renderers, is a
-sky.
+Kinds of files are told from their content, not from their names. Where the depth is missing (0,
+negative or NaN) it is filled by `jaxfx.depth.fill`; inf, and the 1e10 and 65504 of renderers,
+is background.
 """
 
 import argparse
@@ -37,11 +37,11 @@ METHODS = {
     "layered": dof.layered,
     "scatter": dof.scatter,
 }
-# Where no aperture is asked for: the largest circle of confusion, as a share of the width.
+# The largest circle of confusion, as a ratio to the width, where no aperture is given.
 LARGEST_COC = 0.025
-# Where no focal length is known: that of a field of view of 60 degrees across.
+# The focal length over the width where none is given: a field of view of 60 degrees across.
 FOCAL_PER_WIDTH = 0.5 / math.tan(math.radians(30))
-# What one step of a file of integers is where nothing is said: a thousandth of a scene unit.
+# Scene units of one step of an integer depth where no scale is given.
 MILLI = 1e-3
 
 
@@ -66,7 +66,7 @@ def positive(text: str) -> float:
 
 
 def focus(text: str) -> float | tuple[int, int]:
-    """A depth, or the pixel x,y whose depth it is."""
+    """A depth, or the pixel x,y at whose depth to focus."""
     if "," not in text:
         return positive(text)
     try:
@@ -124,21 +124,21 @@ def colors(image: np.ndarray) -> np.ndarray:
 
 
 def read_depth(arguments: argparse.Namespace) -> np.ndarray:
-    """Scene units along the axis, height width, float32; what is missing is NaN."""
+    """Depth in scene units along the axis, height width, float32; NaN where it is missing."""
     stored = io.read_depth(arguments.depth)
     is_depth = not arguments.disparity
     scale = arguments.depth_scale or (MILLI if is_depth and stored.dtype.kind in "iu" else 1.0)
     if is_depth:
-        found = depths.clean(stored, scale=scale)
+        depth = depths.clean(stored, scale=scale)
     elif arguments.baseline and arguments.focal:
-        found = depths.from_stereo(
+        depth = depths.from_stereo(
             stored * np.float32(scale),
             focal_pixels=arguments.focal,
             baseline=arguments.baseline,
             offset=arguments.offset,
         )
     elif arguments.disparity_scale and not arguments.baseline:
-        found = depths.from_disparity(
+        depth = depths.from_disparity(
             stored * np.float32(scale),
             scale=arguments.disparity_scale,
             shift=arguments.disparity_shift,
@@ -147,7 +147,7 @@ def read_depth(arguments: argparse.Namespace) -> np.ndarray:
         raise ValueError(
             "--disparity must have --disparity-scale, or --baseline and --focal of a pair"
         )
-    return np.asarray(found, np.float32)
+    return np.asarray(depth, np.float32)
 
 
 def read(arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +170,7 @@ def read(arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def along_axis(depth: np.ndarray, focal: float) -> np.ndarray:
-    """The depth of a distance along the rays of a camera that looks at the image's middle."""
+    """Depth along the axis from distance along rays, of a camera centered on the image."""
     height, width = depth.shape
     matrix = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     return np.asarray(depths.from_ray_distance(depth, PinholeCamera(matrix, np.eye(4))))
@@ -188,11 +188,12 @@ def read_behind(arguments: argparse.Namespace, shape: tuple[int, ...]) -> tuple 
             f"--behind must have the first layer's size {shape}, got {depth.shape}"
         )
     depth = np.asarray(depths.clean(depth, scale=arguments.depth_scale or 1.0))
-    # What the second layer does not know hides nothing.
+    # Where the second layer is missing there is nothing behind the first.
     return colors(image), np.where(np.isnan(depth), np.float32(np.inf), depth)
 
 
 def focus_depth(chosen: float | tuple[int, int], depth: np.ndarray) -> float:
+    """The depth to focus on, read from the depth map where it is given as a pixel."""
     if not isinstance(chosen, tuple):
         return chosen
     x, y = chosen
@@ -203,18 +204,21 @@ def focus_depth(chosen: float | tuple[int, int], depth: np.ndarray) -> float:
 
 
 def widest(depth: np.ndarray, distance: float, focal: float, width: int) -> float:
-    """The aperture whose largest circle of confusion is LARGEST_COC of the width."""
+    """The aperture whose largest circle of confusion is `LARGEST_COC` of the width."""
     unit = float(np.max(np.abs(1 / distance - 1 / depth)))
     return LARGEST_COC * width / (focal * max(unit, 1e-6))
 
 
 def save_figure(images: dict, depth: np.ndarray, filled: np.ndarray, path: Path) -> None:
-    """The photograph, its depth with what was missing, and every image; no place is blank."""
+    """Save the photograph, its depth with the filled holes in red, and every refocused image.
+
+    The number of columns is one that leaves no place empty.
+    """
     count = 1 + len(images)
     columns = next(c for c in (3, 4, 2, count) if count % c == 0)
     rows = count // columns
     height, width = depth.shape
-    # As wide as high images need to be, and the depth's scale beside them.
+    # Width for the images and the color bar of the depth, height for images and titles.
     size = (4.6 * columns + 0.6, (4.6 * height / width + 0.45) * rows)
     figure = Figure(figsize=size, layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
@@ -250,7 +254,7 @@ def main() -> None:
         whole = depths.fill(depth, color, method=arguments.fill)
         depth, filled = np.asarray(whole.depth), np.asarray(whole.filled)
         chosen = arguments.focus or [float(np.median(depth))]
-        distances = [focus_depth(each, depth) for each in chosen]
+        distances = [focus_depth(choice, depth) for choice in chosen]
     except (OSError, ValueError) as error:
         fail(error)
 

@@ -1,9 +1,9 @@
-"""A light moved and a camera turned, from four cached views of a mesh.
+"""A moving light and a turning camera, from four cached views of a mesh.
 
-Renders four deep frame buffers of a mesh. Then, without the mesh's surfaces, a spot light is
-moved along a path before a camera that stands still, each frame an edit of one light; and the
-camera is turned, each frame a cache synthesized from the four. Shadows come from a shadow map
-of each frame. Writes `relight.gif`, `sheet.png` and `report.json`, with the time of each frame.
+Renders four G-buffers of a mesh. From those alone it draws frames in which a spot light moves
+before a camera that stands still, each an edit of one light; then frames in which the camera
+turns, each from a G-buffer synthesized from the four. Shadows come from a shadow map of each
+frame. Writes `relight.gif`, `sheet.png` and `report.json`, with the time of each frame.
 """
 
 import argparse
@@ -31,7 +31,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-# Where the four caches stand and how far the camera turns: radians about the target, and up.
+# Where the four caches stand: radians about the target, and height as a ratio to the distance.
+# How far the camera turns: radians.
 STATIONS = ((-0.2, 0.0), (0.2, 0.0), (0.0, 0.15), (0.0, -0.05))
 TURN = 0.15
 MAP_SIZE = 512
@@ -42,7 +43,7 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
-    parser.add_argument("--size", type=int, default=480, help="height of the picture, pixels")
+    parser.add_argument("--size", type=int, default=480, help="height of the image, pixels")
     parser.add_argument("--frames", type=int, default=32, help="half of them for the light")
     parser.add_argument(
         "--depth",
@@ -59,7 +60,7 @@ def parse() -> argparse.Namespace:
 
 
 class Stage(NamedTuple):
-    """The mesh, the camera to begin with, and what it looks at."""
+    """The mesh, its first camera, the point that it looks at, and the size of the image."""
 
     mesh: scene.Scene
     camera: PinholeCamera
@@ -105,7 +106,7 @@ class Stage(NamedTuple):
 
 
 def set_stage(path: Path | None, height: int) -> Stage:
-    """The mesh and its camera; a file that won't do ends the program."""
+    """The mesh and its camera; a file that can't be used ends the program."""
     width = height * 4 // 3
     try:
         mesh = scene.still_life() if path is None else scene.load(path)
@@ -120,9 +121,9 @@ def set_stage(path: Path | None, height: int) -> Stage:
 
 @jax.jit
 def warped_depth(gbuffers, cameras, target):
-    """What the caches' own depths say of a new view: the nearest surface that any of them has.
+    """The depth of a new view from the caches' depths: of the nearest surface in any of them.
 
-    A cache's points in the world are warped as if they were its colours.
+    The points in the world of each cache are warped as if they were its colors.
     """
     height, width = gbuffers[0].depth.shape
     nearest = jnp.full((height, width), jnp.inf, jnp.float32)
@@ -138,7 +139,7 @@ def warped_depth(gbuffers, cameras, target):
 
 
 def visibility(stage: Stage, gbuffer, camera, light: SpotLight):
-    """What the light reaches, by a filtered shadow map."""
+    """The visibility of the light, by a filtered shadow map."""
     away = np.asarray(light.direction)
     light_camera = PinholeCamera.look_at(
         light.position,
@@ -212,7 +213,7 @@ class Studio:
 
 
 def play(studio: Studio, frames: int) -> tuple[list, list]:
-    """Every frame's picture, and what is reported of it."""
+    """The image of every frame, and its record for the report."""
     stage, half = studio.stage, frames // 2
     first = stage.light(0.0)
     for _ in range(2):  # The second time nothing is left to compile.
@@ -242,7 +243,7 @@ def play(studio: Studio, frames: int) -> tuple[list, list]:
 
 
 def psnr_to_fresh_cache(studio: Studio, image) -> float:
-    """Against the picture from the view's own cache, with the same lights and shadows."""
+    """PSNR to the image from a G-buffer rendered for the view, under the same lights."""
     truth = studio.stage.gbuffer(studio.camera)
     light = studio.state.lights[0]
     lit = visibility(studio.stage, truth, studio.camera, light)

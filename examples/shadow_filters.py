@@ -1,10 +1,10 @@
-"""Shadows filtered everywhere, and only where it matters.
+"""Shadows filtered everywhere, and only at their edges.
 
 Renders a mesh under one directional light with a shadow map, and shows percentage-closer
-filtering step by step: the hard shadow, its edges, the edges dilated, and the picture filtered
-there alone (`steps.png`). Then, for every size of filter, the full filter beside the masked
-ones, with the comparisons that each makes, the time that it takes and the pixels in which it
-differs from the full one (`sizes.png`, `report.json`).
+filtering step by step: the hard shadow, its edges, the edges dilated, and the image filtered
+there alone (`steps.png`). Then, for every size of filter, it shows the full filter beside the
+masked ones, with the number of comparisons, the time, and the number of pixels that differ from
+the full filter (`sizes.png`, `report.json`).
 """
 
 import argparse
@@ -33,7 +33,7 @@ import matplotlib.pyplot as plt
 
 
 FULL, SCREEN, DEPTH = "full", "screen mask", "depth mask"
-# Calls of which the median time is taken.
+# Timed calls, of which the median is reported.
 ROUNDS = 9
 
 
@@ -43,7 +43,7 @@ def parse() -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--scene", type=Path, help="a mesh; without it, a still life")
-    add("--size", type=int, default=512, help="side of the picture, pixels")
+    add("--size", type=int, default=512, help="side of the image, pixels")
     add("--map-size", type=int, default=1024, help="side of the shadow map, texels")
     add("--filters", type=int, nargs="+", default=[3, 5, 7], help="their sides, odd, texels")
     add(
@@ -66,7 +66,7 @@ def parse() -> argparse.Namespace:
 
 
 class Stage(NamedTuple):
-    """What is compared, and the picture with the light (`lit`) and without it (`dark`)."""
+    """The shadow map, its receivers, and images by the light (`lit`), without it (`dark`)."""
 
     shadow_map: jax.Array
     receivers: shadow.Receivers
@@ -75,13 +75,13 @@ class Stage(NamedTuple):
     dark: np.ndarray
 
     def picture(self, visible) -> np.ndarray:
-        """The picture under the shadow, as bytes."""
+        """The image under the shadow, as bytes."""
         linear = self.dark + np.asarray(visible)[..., None] * self.lit
         return np.rint(255 * io.srgb_from_linear(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
 def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
-    """The mesh seen by a camera and by a light; a file that won't do ends the program."""
+    """A mesh before a camera and a light; a file that can't be used ends the program."""
     try:
         mesh = scene.still_life() if path is None else scene.load(path)
         camera = scene.default_camera(mesh, height=size, width=size)
@@ -91,7 +91,7 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
     turn = np.asarray(camera.world_from_camera)[:3, :3]
     key = DirectionalLight(turn @ [0.6, 0.7, 0.55], [0.8, 0.76, 0.7])
 
-    # The map takes in what is seen, and what lies as far again towards the light.
+    # The map covers a ball about the visible points, and as much again towards the light.
     seen = np.isfinite(gbuffer.depth)
     depth = jnp.where(seen, gbuffer.depth, 1)
     points = np.asarray(camera.points(depth))[seen]
@@ -108,16 +108,16 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
 
 
 def options(size: int, dilation: int | None) -> dict[str, dict[str, Any]]:
-    """Of every method; a plane stays lit if the bias grows with its slope."""
+    """The options of every method; a bias that grows with the slope keeps a plane lit."""
     same = {"size": size, "slope_bias": size / 2}
     screen = {"edges": "screen", "dilation": dilation or size // 2 + 1}
     return {FULL: same, DEPTH: same | {"edges": "depth"}, SCREEN: same | screen}
 
 
-def timed(stage: Stage, function, **how):
+def timed(stage: Stage, function, **options):
     """The result of a compiled call, and the median of its milliseconds."""
     data = stage.shadow_map, stage.receivers, stage.bias
-    program = jax.jit(lambda m, r, bias: function(m, r, bias=bias, **how)).lower(*data)
+    program = jax.jit(lambda m, r, bias: function(m, r, bias=bias, **options)).lower(*data)
     program, times = program.compile(), []
     result = program(*data)
     for _ in range(ROUNDS):
@@ -128,7 +128,7 @@ def timed(stage: Stage, function, **how):
 
 
 def compare(stage: Stage, size: int, dilation: int | None) -> tuple[dict, list[dict]]:
-    """The visibilities and the masks of one size of filter, and what is reported of each."""
+    """Visibilities and masks of one size of filter, by method, and their records."""
     pictures, records = {}, []
     for method, how in options(size, dilation).items():
         function = shadow.pcf if method == FULL else shadow.edge_pcf
@@ -155,13 +155,13 @@ def compare(stage: Stage, size: int, dilation: int | None) -> tuple[dict, list[d
 
 
 def marked(picture: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """The picture greyed, with the pixels of a mask in red."""
+    """The image in gray, with the pixels of a mask in red."""
     grey = 0.6 * picture.mean(axis=-1, keepdims=True) + 100
     return np.where(where[..., None], [220, 30, 30], grey).astype(np.uint8)
 
 
 def draw_steps(stage: Stage, size: int, visible, where, path: Path) -> None:
-    """The screen mask's way from the hard shadow to the filtered one."""
+    """Draw the steps of the screen mask, from the hard shadow to the filtered one."""
     bias = {"bias": stage.bias, "slope_bias": size / 2}
     data = stage.shadow_map, stage.receivers
     hard = stage.picture(shadow.hard(*data, **bias))
@@ -179,7 +179,7 @@ def draw_steps(stage: Stage, size: int, visible, where, path: Path) -> None:
 
 
 def draw_sizes(stage: Stage, every: list[tuple[dict, list[dict]]], path: Path) -> None:
-    """A row for each size: the full filter, and where each mask filters and differs."""
+    """Draw a row for each size: the full filter, and the mask of each of the others."""
     rows = len(every)
     figure, axes = plt.subplots(
         rows, 3, figsize=(12, 4.5 * rows), layout="constrained", squeeze=False

@@ -30,7 +30,7 @@ _LOST = 1e30
 _BOUNDS = 8
 
 
-class Seen(NamedTuple):
+class Samples(NamedTuple):
     """What rays from the target's pixels show of their sources.
 
     - `pixel`: the index of the pixel, row by row; one past the last for a ray that fills a
@@ -77,10 +77,10 @@ class Blend(eqx.Module):
     def __call__(self, images: Any, depths: Any, cameras: Any, target: Any) -> Any:
         """Image and alpha, called like `reproject.blend`."""
         parts = _chosen(self.parts, images, depths, cameras)
-        seen = _seen(parts, target, self.shape, self.max_steps)
-        color, known = _blended(seen, self.shape[0] * self.shape[1])
-        known = known.astype(color.dtype)
-        return color.reshape(*self.shape, -1), known.reshape(self.shape)
+        samples = _sampled(parts, target, self.shape, self.max_steps)
+        color, is_known = _blended(samples, self.shape[0] * self.shape[1])
+        alpha = is_known.astype(color.dtype)
+        return color.reshape(*self.shape, -1), alpha.reshape(self.shape)
 
 
 def reproject(
@@ -191,34 +191,36 @@ def _needed(
     tile, count = tile_of(size), len(cameras)
     everything = np.ones((count, size[0] * size[1]), bool)
     parts = blocks(everything, list(zip(images, depths, cameras, strict=True)))
-    seen = _seen(_chosen(parts, images, depths, cameras), target, size, None)
-    weights = _weights(seen, everything.shape[1])
+    samples = _sampled(_chosen(parts, images, depths, cameras), target, size, None)
+    weights = _weights(samples, everything.shape[1])
     source = np.concatenate(
         [np.repeat(np.array(p.members)[np.asarray(p.item)], p.pixels.shape[1]) for p in parts]
     )
     # The last column is of rays that fill a block.
     shares = np.zeros((count, everything.shape[1] + 1))
     steps = np.zeros(shares.shape, np.int32)
-    shares[source, seen.pixel], steps[source, seen.pixel] = weights, seen.steps
+    shares[source, samples.pixel], steps[source, samples.pixel] = weights, samples.steps
     # The rank of each source in a tile, the one of the largest weight first.
     place = np.argsort(np.argsort(-sums(shares[:, :-1], tile), axis=1), axis=1)
-    tile_of_ray = np.append(tile, 0)[seen.pixel]
+    tile_of_ray = np.append(tile, 0)[samples.pixel]
     own = place[tile_of_ray, source]
-    squares = _squares(seen, own, np.arange(count, -1, -1), size)
-    numbers = squares.shape[1] * seen.color.shape[1]
+    squares = _squares(samples, own, np.arange(count, -1, -1), size)
+    numbers = squares.shape[1] * samples.color.shape[1]
     kept = count - spend(sums(squares, tile), max_error, numbers)
     uses, steps = (place < kept[:, None])[tile].T, steps[:, :-1]
 
     longest = int(np.max(steps, where=uses, initial=0))
     bounds = np.unique(np.arange(1, _BOUNDS) * longest // _BOUNDS)
-    taken = np.where(own < kept[tile_of_ray], seen.steps, np.iinfo(np.int32).max)
-    squares = _squares(seen, taken, bounds + 1, size)
+    taken = np.where(own < kept[tile_of_ray], samples.steps, np.iinfo(np.int32).max)
+    squares = _squares(samples, taken, bounds + 1, size)
     enough = bounds[(bounds > 0) & (squares.sum(axis=1) <= allowed(max_error, numbers))]
     return uses, steps, int(enough[0]) if enough.size else None
 
 
 @eqx.filter_jit
-def _seen(parts: list[Any], target: Any, size: tuple[int, int], max_steps: int | None) -> Seen:
+def _sampled(
+    parts: list[Any], target: Any, size: tuple[int, int], max_steps: int | None
+) -> Samples:
     """What all rays show, block after block.
 
     `parts` are those of `_chosen`, `size` is height and width of the result.
@@ -228,56 +230,60 @@ def _seen(parts: list[Any], target: Any, size: tuple[int, int], max_steps: int |
     for members, *of_each in parts:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
 
-        def block(each, stacked=stacked):
-            source, pixels = each
+        def block(item, stacked=stacked):
+            source, pixels = item
             image, depth, camera = jax.tree.map(lambda x: x[source], stacked)
             rays = Sight(target, points.at[pixels].get(mode="clip"), options)
             view, along, z = rays(depth, camera)
             color = view.patch.read_colors(image)
-            return Seen(pixels, color, view.mask, along, z, view.steps)
+            return Samples(pixels, color, view.mask, along, z, view.steps)
 
         rays = jax.lax.map(block, tuple(of_each))
         shown.append(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rays))
-    joined = lambda *each: jnp.concatenate([x.astype(each[0].dtype) for x in each])
+    joined = lambda *leaves: jnp.concatenate([x.astype(leaves[0].dtype) for x in leaves])
     return jax.tree.map(joined, *shown)
 
 
 @eqx.filter_jit
-def _weights(seen: Seen, count: int) -> Float[Array, " ray"]:
+def _weights(samples: Samples, count: int) -> Float[Array, " ray"]:
     """The weight of each ray in its pixel, as in `reproject.blend`; `count` pixels."""
-    z = jnp.where(seen.mask, seen.z, jnp.inf)
-    nearest = jnp.full(count, jnp.inf, z.dtype).at[seen.pixel].min(z, mode="drop")
-    nearest = nearest.at[seen.pixel].get(mode="clip")
-    front = seen.mask & (z <= (1 + _OPTIONS["hole_threshold"]) * nearest)
-    return jax.lax.stop_gradient(jnp.where(front, seen.along**8, 0))
+    z = jnp.where(samples.mask, samples.z, jnp.inf)
+    nearest = jnp.full(count, jnp.inf, z.dtype).at[samples.pixel].min(z, mode="drop")
+    nearest = nearest.at[samples.pixel].get(mode="clip")
+    front = samples.mask & (z <= (1 + _OPTIONS["hole_threshold"]) * nearest)
+    return jax.lax.stop_gradient(jnp.where(front, samples.along**8, 0))
 
 
 @eqx.filter_jit
-def _blended(seen: Seen, count: int) -> tuple[Float[Array, "pixel channel"], Array]:
+def _blended(samples: Samples, count: int) -> tuple[Float[Array, "pixel channel"], Array]:
     """The mean color of each pixel, and whether it has one."""
-    weight = _weights(seen, count).astype(seen.color.dtype)[:, None]
-    color = jnp.where(weight > 0, seen.color, 0) * weight
+    weight = _weights(samples, count).astype(samples.color.dtype)[:, None]
+    color = jnp.where(weight > 0, samples.color, 0) * weight
     both = jnp.concatenate([color, weight], axis=-1)
-    both = jnp.zeros((count, both.shape[1]), both.dtype).at[seen.pixel].add(both, mode="drop")
+    both = (
+        jnp.zeros((count, both.shape[1]), both.dtype).at[samples.pixel].add(both, mode="drop")
+    )
     weights = jnp.broadcast_to(both[:, -1:], (count, both.shape[1] - 1))
     return safe_divide(both[:, :-1], weights), weights[:, 0] > 0
 
 
 def _squares(
-    seen: Seen, place: np.ndarray, kept: np.ndarray, size: tuple[int, int]
+    samples: Samples, place: np.ndarray, kept: np.ndarray, size: tuple[int, int]
 ) -> Float[np.ndarray, "level pixel"]:
     """The squared error of each pixel where rays of `place` below each of `kept` are drawn."""
     places, levels = jnp.asarray(place, jnp.int32), jnp.asarray(kept, jnp.int32)
-    return np.asarray(_errors(seen, places, levels, size[0] * size[1]), np.float64)
+    return np.asarray(_errors(samples, places, levels, size[0] * size[1]), np.float64)
 
 
 @eqx.filter_jit
-def _errors(seen: Seen, place: Array, kept: Array, count: int) -> Array:
+def _errors(samples: Samples, place: Array, kept: Array, count: int) -> Array:
     """As `_squares`, level pixel."""
-    color, known = _blended(seen, count)
+    color, is_known = _blended(samples, count)
 
     def square(kept):
-        less, shown = _blended(seen._replace(mask=seen.mask & (place < kept)), count)
-        return jnp.sum((less - color) ** 2, axis=-1) + jnp.where(known & ~shown, _LOST, 0)
+        fewer = samples._replace(mask=samples.mask & (place < kept))
+        without, is_shown = _blended(fewer, count)
+        lost = jnp.where(is_known & ~is_shown, _LOST, 0)
+        return jnp.sum((without - color) ** 2, axis=-1) + lost
 
     return jax.lax.map(square, kept)

@@ -154,13 +154,13 @@ def shadow(
     where = candidates(
         shadow_map, receivers, size=size, bias=biases[0], slope_bias=biases[1]
     ).where
-    share = float(jnp.mean(where))
+    mask_share = float(jnp.mean(where))
     filtered = lambda smaller, masked=True: Filter(*biases, size, smaller, masked)
     data, text = (shadow_map, receivers), "the filter"
-    if share**0.5 <= max_error:
-        why = f"it can't matter in more than {share:.2%} of the pixels."
+    if mask_share**0.5 <= max_error:
+        why = f"it can't matter in more than {mask_share:.2%} of the pixels."
         seconds = timed(filtered(1), data)[1]
-        return plan(filtered(1), share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
+        return plan(filtered(1), mask_share**0.5, seconds, float("nan"), [f"{text}, for {why}"])
     search = Search(filtered(size, False), data, max_error)
     picked = _pick(search, filtered(1))
     few = np.count_nonzero(picked < where.size) / where.size
@@ -168,18 +168,18 @@ def shadow(
         some = f"{text} but in {few:.1%} of the pixels, held fixed"
         search.measure(Picked(*biases, size, jnp.asarray(picked, jnp.int32)), some)
     # Fewer pixels, and no mask, can't take longer.
-    if not 0 < few < share:
-        outside = f"{text} outside of the {share:.1%} of the pixels where it matters"
+    if not 0 < few < mask_share:
+        outside = f"{text} outside of the {mask_share:.1%} of the pixels where it matters"
         search.measure(filtered(size), outside)
     # Filters differ inside the mask alone: some of its pixels tell by how much.
     inside = np.flatnonzero(where)
     inside = inside[np.linspace(0, inside.size - 1, min(_SOME, where.size)).astype(int)]
     probed = filter_arguments("shadow", *data, *biases, size=size)[:4]
     for smaller, square in zip(range(1, size, 2), _squares(size, inside, *probed), strict=True):
-        less = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
-        if (square := share * float(square)) > max_error**2:
-            search.tried.append(Trial(filtered(smaller), less, (square,), math.inf))
-        elif search.measure(filtered(smaller), less).error <= max_error:
+        left_out = text if smaller == 1 else f"a filter larger than {smaller} x {smaller}"
+        if (square := mask_share * float(square)) > max_error**2:
+            search.tried.append(Trial(filtered(smaller), left_out, (square,), math.inf))
+        elif search.measure(filtered(smaller), left_out).error <= max_error:
             break
     return search.plan()
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxfx._arguments import check_lens
 from jaxfx._checks import check, check_depth, check_image, check_shape, items, option, parameter
 from jaxfx.dof.sprites import POINT_RADIUS
-from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Pictures, Values
+from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Images, Values
 from jaxfx.fit._lens_residual import Tone
 from jaxfx.lens import ThinLens
 
@@ -31,10 +31,10 @@ def options(**given: Any) -> None:
         option(f"dof({name}=...)", value, get_args(_OPTIONS[name]))
 
 
-def pictures(
+def images(
     reference: Any, image: Any, depth: Any, lens: Any, behind: Any, weights: Any
-) -> tuple[Pictures, tuple[ThinLens, ...]]:
-    """The pictures, checked, in the type of `image`, and their lenses."""
+) -> tuple[Images, tuple[ThinLens, ...]]:
+    """The images, checked, in the type of `image`, and their lenses."""
     image = check_image("dof(image)", image)
     depth = check_depth("dof(depth)", depth, image.shape[:2])
     references = _references(reference, image)
@@ -49,17 +49,19 @@ def pictures(
         check("dof(lens.aperture)", start.aperture, is_positive, expected)
     if len(lenses) != len(references):
         raise ValueError(
-            f"`dof(lens)` must be one for each of {len(references)} pictures, "
+            f"`dof(lens)` must be one for each of {len(references)} photographs, "
             f"got {len(lenses)}."
         )
     if behind is not None:
         behind = _behind(behind, image)
     focal_pixels = jnp.stack([start.focal_pixels.astype(image.dtype) for start in lenses])
     weights = _weights(weights, image)
-    return Pictures(references, image, depth, behind, weights, focal_pixels), lenses
+    return Images(references, image, depth, behind, weights, focal_pixels), lenses
 
 
-def _references(reference: Any, image: Array) -> Float[Array, "picture height width channel"]:
+def _references(
+    reference: Any, image: Array
+) -> Float[Array, "photograph height width channel"]:
     """One photograph or a list of them, stacked, in the type of `image`."""
     is_list = isinstance(reference, list | tuple) and all(np.ndim(x) == 3 for x in reference)
     given = [*reference] if is_list else [reference]
@@ -120,7 +122,7 @@ def start(
 
 
 def check_moves(
-    names: Collection[str], lenses: tuple[ThinLens, ...], pictures: Pictures, max_coc: Any
+    names: Collection[str], lenses: tuple[ThinLens, ...], images: Images, max_coc: Any
 ) -> None:
     """`ValueError` where a lens is sought that no derivative moves.
 
@@ -129,7 +131,7 @@ def check_moves(
     """
     if not set(LENS).intersection(names):
         return
-    depths = [pictures.depth] + ([] if pictures.behind is None else [pictures.behind[1]])
+    depths = [images.depth] + ([] if images.behind is None else [images.behind[1]])
     most = math.inf if max_coc is None else max_coc
     for lens in lenses:
         circles = [jnp.where(d > 0, lens.circle_of_confusion(d), jnp.nan) for d in depths]

@@ -24,7 +24,7 @@ from jaxfx.lens import ThinLens
 Effect = Literal["scatter", "layered"]
 Values = dict[str, Array]
 
-# The parameters of a lens, of which each picture has its own, and those of the depth: its
+# The parameters of a lens, of which each photograph has its own, and those of the depth: its
 # inverse is `scale` times the inverse of the given depth, plus `shift`.
 LENS = ("aperture", "focus_distance")
 DISPARITY = ("scale", "shift")
@@ -39,7 +39,7 @@ _SMALLEST = 1e-6
 _SMALL_COC = 8.0
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     """The images of a fit, all of one size and type.
 
     - `references`: the photographs, one for each lens.
@@ -48,20 +48,20 @@ class Pictures(NamedTuple):
     - `focal_pixels`: focal length of each lens, in pixels.
     """
 
-    references: Float[Array, "picture height width channel"]
+    references: Float[Array, "photograph height width channel"]
     image: Float[Array, "height width channel"]
     depth: Float[Array, "height width"]
     behind: tuple[Any, Any] | None
     weights: Float[Array, "height width"]
-    focal_pixels: Float[Array, " picture"]
+    focal_pixels: Float[Array, " photograph"]
 
-    def shrunk(self, factor: int) -> "Pictures":
-        """The same pictures at a size smaller by a whole factor."""
+    def shrunk(self, factor: int) -> "Images":
+        """The same images at a size smaller by a whole factor."""
         small = functools.partial(reduced, factor=factor)
         behind = self.behind
         if behind is not None:
             behind = small(behind[0]), thinned(behind[1], factor)
-        return Pictures(
+        return Images(
             jax.vmap(small)(self.references),
             small(self.image),
             thinned(self.depth, factor),
@@ -74,13 +74,13 @@ class Pictures(NamedTuple):
 class Model(eqx.Module):
     """An effect as a function of the parameters that are sought, the others held at the start.
 
-    - `start`: all parameters; those of `LENS` have an entry for each picture.
+    - `start`: all parameters; those of `LENS` have an entry for each photograph.
     - `corrects`: 1 where the footprint is free, 0 where it is held at 0.
     - `names`: the parameters that are sought.
     - `max_coc`: the largest circle of confusion that is drawn, in pixels.
     """
 
-    pictures: Pictures
+    images: Images
     start: Values
     corrects: Float[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
@@ -112,7 +112,7 @@ class Model(eqx.Module):
         return values
 
     def _median_inverse_depth(self) -> Array:
-        depth = self.pictures.depth
+        depth = self.images.depth
         is_known = (depth > 0) & jnp.isfinite(depth)
         return jnp.nanmedian(jnp.where(is_known, 1 / jnp.where(is_known, depth, 1), jnp.nan))
 
@@ -121,7 +121,7 @@ class Model(eqx.Module):
 
         An inverse depth that comes to 0 or less is background.
         """
-        depth, behind = self.pictures.depth, self.pictures.behind
+        depth, behind = self.images.depth, self.images.behind
         if not set(DISPARITY).intersection(self.names):
             return depth, behind
 
@@ -134,25 +134,25 @@ class Model(eqx.Module):
 
         return rescaled(depth), None if behind is None else (behind[0], rescaled(behind[1]))
 
-    def lens(self, values: Values, picture: int) -> ThinLens:
-        """The lens of one picture."""
-        aperture, focus_distance = (values[name][picture] for name in LENS)
-        return ThinLens(aperture, focus_distance, self.pictures.focal_pixels[picture])
+    def lens(self, values: Values, photograph: int) -> ThinLens:
+        """The lens of one photograph."""
+        aperture, focus_distance = (values[name][photograph] for name in LENS)
+        return ThinLens(aperture, focus_distance, self.images.focal_pixels[photograph])
 
-    def circles(self, values: Values) -> Float[Array, "picture height width"]:
+    def circles(self, values: Values) -> Float[Array, "photograph height width"]:
         """The circles of confusion in pixels, 0 where the depth is missing."""
         depth, _ = self.depths(values)
-        count = self.pictures.focal_pixels.size
-        lenses = (self.lens(values, picture) for picture in range(count))
+        count = self.images.focal_pixels.size
+        lenses = (self.lens(values, photograph) for photograph in range(count))
         circles = jnp.stack([lens.circle_of_confusion(depth) for lens in lenses])
         return jnp.where(depth > 0, circles, 0)
 
-    def __call__(self, values: Values) -> Float[Array, "picture height width channel"]:
+    def __call__(self, values: Values) -> Float[Array, "photograph height width channel"]:
         """The images that the effect draws, footprint included."""
         depth, behind = self.depths(values)
 
         def draw(aperture, focus_distance, focal_pixels):
-            image = self.pictures.image
+            image = self.images.image
             lens = ThinLens(aperture, focus_distance, focal_pixels)
             if self.effect == "scatter":
                 drawn = scatter(
@@ -177,7 +177,7 @@ class Model(eqx.Module):
             coc = jnp.where(depth > 0, lens.circle_of_confusion(depth), 0)
             return drawn + values["footprint"] * _missing_blur(drawn, coc)
 
-        focal_pixels = self.pictures.focal_pixels
+        focal_pixels = self.images.focal_pixels
         apertures, focus_distances = (values[name] for name in LENS)
         if focal_pixels.size == 1:
             return draw(apertures[0], focus_distances[0], focal_pixels[0])[None]

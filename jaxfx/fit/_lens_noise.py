@@ -67,9 +67,9 @@ def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
 @eqx.filter_jit
 def _noise(model, values, difference, sensitivity, has_edges):
     """Standard deviations in units of radiance: per pixel, and of pixels far from edges."""
-    sensitivity = sensitivity * model.pictures.weights[None, ..., None]
+    sensitivity = sensitivity * model.images.weights[None, ..., None]
     tiny = jnp.finfo(sensitivity.dtype).tiny
-    least = _LEAST_NOISE * jnp.std(model.pictures.references) + tiny
+    least = _LEAST_NOISE * jnp.std(model.images.references) + tiny
     deviation = functools.partial(_deviation, jnp.abs(difference), least=least)
     size = jnp.max(jnp.abs(difference), axis=-1)
     without_outliers = lambda scale: jnp.where(size > _OUTLIER * scale, jnp.inf, scale)
@@ -87,11 +87,11 @@ def _noise(model, values, difference, sensitivity, has_edges):
     return without_outliers(scale), away
 
 
-def _defocus(model: Model, values: Values) -> Float[Array, "picture height width"]:
+def _defocus(model: Model, values: Values) -> Float[Array, "photograph height width"]:
     """The defocus in pixels, NaN where the depth is missing."""
     depth, _ = model.depths(values)
-    count = model.pictures.focal_pixels.size
-    defocus = [model.lens(values, picture).defocus(depth) for picture in range(count)]
+    count = model.images.focal_pixels.size
+    defocus = [model.lens(values, photograph).defocus(depth) for photograph in range(count)]
     return jnp.where(depth > 0, jnp.stack(defocus), jnp.nan)
 
 
@@ -118,8 +118,8 @@ def _deviation(size: Array, weight: Array, least: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnames=("channels", "bins"))
 def strata(
-    circles: Float[Array, "picture height width"],
-    scale: Float[Array, "picture height width"],
+    circles: Float[Array, "photograph height width"],
+    scale: Float[Array, "photograph height width"],
     channels: int,
     bins: int = STRATA,
 ) -> Int[Array, " residual"]:

@@ -28,7 +28,7 @@ class Residual(eqx.Module):
     """
 
     model: Model
-    scale: Float[Array, "picture height width"]
+    scale: Float[Array, "photograph height width"]
     unit: Float[Array, ""]
     is_robust: bool = eqx.field(static=True)
     exposure: bool = eqx.field(static=True)
@@ -36,32 +36,32 @@ class Residual(eqx.Module):
 
     def compare(self, unknowns: Values) -> tuple[Array, Array, Array, Array]:
         """The difference per pixel after tone, the images drawn, and their gain and offset."""
-        pictures = self.model.pictures
+        images = self.model.images
         drawn = self.model(self.model.values(unknowns))
-        counts = pictures.weights[None] / (self.scale / self.unit) ** 2
+        counts = images.weights[None] / (self.scale / self.unit) ** 2
 
         def exposed(drawn, reference, counts, scale):
             return exposure_between(drawn, reference, counts, scale[..., None], self.exposure)
 
-        gain, offset = jax.vmap(exposed)(drawn, pictures.references, counts, self.scale)
+        gain, offset = jax.vmap(exposed)(drawn, images.references, counts, self.scale)
         shown = gain * drawn + offset
-        tone = functools.partial(_log_tone, white=jnp.mean(jnp.abs(pictures.references)))
+        tone = functools.partial(_log_tone, white=jnp.mean(jnp.abs(images.references)))
         toned = tone if self.tone == "log" else lambda x: x
-        difference = toned(shown) - toned(pictures.references)
+        difference = toned(shown) - toned(images.references)
         return difference, drawn, gain[:, 0, 0], offset[:, 0, 0]
 
-    def weighted(self, difference: Array) -> Float[Array, "picture height width channel"]:
+    def weighted(self, difference: Array) -> Float[Array, "photograph height width channel"]:
         """Differences per pixel as residuals: their squares are the loss.
 
         They are in units of radiance, those of pixels far from edges at their own size.
         """
-        root = jnp.sqrt(self.model.pictures.weights)[None, ..., None]
+        root = jnp.sqrt(self.model.images.weights)[None, ..., None]
         if not self.is_robust:
             return (root * difference).astype(float)
         deviations = (difference / self.scale[..., None]).astype(float)
         return self.unit.astype(float) * root.astype(float) * huber(deviations)
 
-    def __call__(self, unknowns: Values) -> Float[Array, "picture height width channel"]:
+    def __call__(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
         return self.weighted(self.compare(unknowns)[0])
 
 
@@ -73,7 +73,7 @@ def _log_tone(x: Array, white: Array) -> Array:
 
 def plain(model: Model, exposure: bool, tone: Tone) -> Residual:
     """The residual of plain squares."""
-    one = jnp.ones(model.pictures.references.shape[:3], model.pictures.image.dtype)
+    one = jnp.ones(model.images.references.shape[:3], model.images.image.dtype)
     return Residual(model, one, one[0, 0, 0], False, exposure, tone)
 
 
@@ -83,14 +83,14 @@ def evaluate(residual: Residual, unknowns: Values) -> tuple[Array, Array, Array,
     return residual.compare(unknowns)
 
 
-def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " picture"]:
-    """The mean absolute difference of each picture, in units of radiance.
+def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " photograph"]:
+    """The mean absolute difference of each photograph, in units of radiance.
 
     It ranks lenses before any noise is estimated: unlike a mean square, it is not decided by a
     few large differences.
     """
     difference = evaluate(residual, unknowns)[0]
-    weights = residual.model.pictures.weights[None, ..., None]
+    weights = residual.model.images.weights[None, ..., None]
     return jnp.mean(jnp.abs(difference) * weights, axis=(1, 2, 3))
 
 

@@ -53,7 +53,7 @@ class Search(NamedTuple):
     - `solve`: `descend` with a solver.
     - `is_robust`: whether noise is estimated and small circles are corrected.
     - `max_coc`: the largest diameter that may be drawn, in pixels; None for any.
-    - `ratios`: the parameters that have one factor for all pictures.
+    - `ratios`: the parameters that have one factor for all images.
     """
 
     residual: Callable[[Model], Residual]
@@ -69,8 +69,8 @@ class Search(NamedTuple):
         edges with a noise of their own: refine the best end. Then the images as given.
         """
         shrink = _shrink(model)
-        pictures = model.pictures if shrink == 1 else model.pictures.shrunk(shrink)
-        small = dataclasses.replace(model, pictures=pictures)
+        images = model.images if shrink == 1 else model.images.shrunk(shrink)
+        small = dataclasses.replace(model, images=images)
         small = self._with_bound(small, model.start, _TRIED_MARGIN, shrink)
         residual = self.residual(small)
         starts = self._best_starts(residual)
@@ -134,8 +134,8 @@ class Search(NamedTuple):
         if self.max_coc is not None:
             return dataclasses.replace(model, max_coc=self.max_coc / shrink)
         depth, _ = model.depths(values)
-        count = len(model.pictures.references)
-        lenses = [model.lens(values, picture) for picture in range(count)]
+        count = len(model.images.references)
+        lenses = [model.lens(values, photograph) for photograph in range(count)]
         largest = max(largest_coc("dof", depth, lens) for lens in lenses)
         if margin * largest <= model.max_coc:
             return model
@@ -145,7 +145,7 @@ class Search(NamedTuple):
     def _best_starts(self, residual: Residual) -> list[Values]:
         """The unknowns of the best lenses out of `_FACTORS`, one set for each search.
 
-        Each picture takes its own best lens, unless their ratios are known.
+        Each photograph takes its own best lens, unless their ratios are known.
         """
         model = residual.model
         origin = _origin(model, self.ratios)
@@ -159,14 +159,14 @@ class Search(NamedTuple):
             name: origin[name] + value for name, value in zip(names, point, strict=True)
         }
         sizes = [mean_size(residual, origin | at_point(point)) for point in points]
-        sizes = np.asarray(jnp.stack(sizes), float)  # point, picture
+        sizes = np.asarray(jnp.stack(sizes), float)  # point, photograph
         if self.ratios:
             sizes = np.broadcast_to(sizes.sum(axis=1, keepdims=True), sizes.shape)
         table = [len(factor) for factor in factors]
         order = np.stack([_lowest(column.reshape(table)) for column in sizes.T])
         starts = []
         for rank in order.T:
-            chosen = points[rank]  # picture, name
+            chosen = points[rank]  # photograph, name
             start = dict(origin)
             for name, values in zip(names, chosen.T, strict=True):
                 start[name] = origin[name] + (values if origin[name].ndim else values[0])
@@ -175,7 +175,7 @@ class Search(NamedTuple):
 
 
 def _origin(model: Model, ratios: tuple[str, ...]) -> Values:
-    """The unknowns of the user's start, zeros: one per picture where each has its own."""
+    """The unknowns of the user's start, zeros: one per photograph where each has its own."""
     shape = lambda name: () if name in ratios else model.start[name].shape
     return {name: jnp.zeros(shape(name), float) for name in model.names}
 
@@ -201,7 +201,7 @@ def _ranked(residual: Residual, ends: list[End]) -> list[End]:
 
 def _shrink(model: Model) -> int:
     """The whole factor by which the first images are smaller."""
-    side = max(model.pictures.depth.shape)
+    side = max(model.images.depth.shape)
     circles = model.circles(model.start)
     largest = float(jnp.max(jnp.where(jnp.isfinite(circles), circles, 0)))
     return max(1, min(math.ceil(side / _COARSE), int(largest / _LEAST_COC)))

@@ -59,27 +59,27 @@ def evidence(
     columns: Float[Array, "residual number"],
     image: Float[Array, "height width 3"],
     reference: Float[Array, "height width 3"],
-    given: Float[Array, "height width"],
+    base_weight: Float[Array, "height width"],
     weight: Float[Array, "height width"],
     noise: Float[Array, "2"],
 ) -> Evidence:
     """Standard errors and quality at the end of a search.
 
     `columns` is the Jacobian of `image` there, in the order of the lights and of their values.
-    `given` are the user's weights, `weight` those at the end; `noise` is that of `_robust`, inf
-    where all pixels count as given.
+    `base_weight` is the user's weight, `weight` that at the end; `noise` is that of `_robust`,
+    inf where the loss is plain squares.
     """
     exact = lambda *arrays: (array.astype(float) for array in arrays)
     columns, image, reference, noise = exact(columns, image, reference, noise)
-    given, weight, basis = exact(given, weight, _basis(model, lights))
+    base_weight, weight, basis = exact(base_weight, weight, _basis(model, lights))
     root = jnp.sqrt(weight)[..., None]
     columns = jnp.repeat(root, 3, axis=2).reshape(-1, 1) * columns
-    length = lengths(image - reference, given)
-    flat = flatness(length, noise, given)
+    length = lengths(image - reference, base_weight)
+    flat = flatness(length, noise, base_weight)
     residual = root * jnp.where(flat > 0, (image - reference) / flat, jnp.inf)
     block, count = tiles(residual.shape)
     variances = jnp.diagonal(covariance(columns, residual.reshape(-1), block, count))
-    least = LEAST_NOISE * brightness(reference, given)
+    least = LEAST_NOISE * brightness(reference, base_weight)
     floor = independent_errors(columns, jnp.full_like(residual, least))
     errors = jnp.sqrt(jnp.maximum(variances, floor**2))
     projection = _null_projection(np.asarray(columns, np.float64))
@@ -95,9 +95,9 @@ def evidence(
     return Evidence(
         by_light,
         _groups([*near, *_dependent(projection, np.array(owners))]),
-        _untold(model, lights, by_light, basis, reference, given),
-        jnp.sum(jnp.where(is_reached, weight, 0)) / jnp.sum(given),
-        _explained(reference, given, jnp.minimum(length[0], CUT * noise[0])),
+        _untold(model, lights, by_light, basis, reference, base_weight),
+        jnp.sum(jnp.where(is_reached, weight, 0)) / jnp.sum(base_weight),
+        _explained(reference, base_weight, jnp.minimum(length[0], CUT * noise[0])),
     )
 
 
@@ -127,23 +127,23 @@ def _basis(model, lights):
 
 
 def brightness(
-    image: Float[Array, "height width 3"], given: Float[Array, "height width"]
+    image: Float[Array, "height width 3"], base_weight: Float[Array, "height width"]
 ) -> Float[Array, ""]:
     """The root mean square of an image by weight; 1 for black."""
-    root = jnp.sqrt(jnp.mean(given[..., None] * image**2) / jnp.mean(given))
+    root = jnp.sqrt(jnp.mean(base_weight[..., None] * image**2) / jnp.mean(base_weight))
     return jnp.where(root > 0, root, 1)
 
 
 def _explained(
     reference: Float[Array, "height width 3"],
-    given: Float[Array, "height width"],
+    base_weight: Float[Array, "height width"],
     length: Float[Array, "height width"],
 ) -> Float[Array, ""]:
     """The ratio of the reference's contrast that residuals of these lengths do not take up."""
-    weight = (given / jnp.sum(given))[..., None]
+    weight = (base_weight / jnp.sum(base_weight))[..., None]
     mean = jnp.sum(weight * reference, axis=(0, 1), keepdims=True)
     contrast = jnp.sum(weight * (reference - mean) ** 2)
-    least = 3 * (_LEAST_CONTRAST * brightness(reference, given)) ** 2
+    least = 3 * (_LEAST_CONTRAST * brightness(reference, base_weight)) ** 2
     return 1 - jnp.sum(weight[..., 0] * length**2) / jnp.maximum(contrast, least)
 
 
@@ -153,20 +153,20 @@ def _untold(
     errors: Errors,
     basis: Float[Array, "light height width 3"],
     reference: Float[Array, "height width 3"],
-    given: Float[Array, "height width"],
+    base_weight: Float[Array, "height width"],
 ) -> tuple[tuple[int, str], ...]:
     """The parameters that are not determined, as the index of their light and their name.
 
     `basis` is what each light adds to the image if it is white.
     """
-    whole, names = brightness(reference, given), []
+    whole, names = brightness(reference, base_weight), []
     fields: tuple[Any, ...] = lights
     for index, (light, own, white) in enumerate(zip(fields, errors, basis, strict=True)):
-        lit = given * jnp.sum(white, axis=-1)
+        lit = base_weight * jnp.sum(white, axis=-1)
         for name, error in own.items():
             size = 1.0
             if name == "color":
-                size = whole / brightness(white, given)
+                size = whole / brightness(white, base_weight)
             elif name == "position":
                 lit_point = mean_point(model.gbuffer, model.camera, lit)
                 size = jnp.linalg.norm(light.position - lit_point)

@@ -60,21 +60,21 @@ def search_once(
     model: Model,
     lights: tuple[Light, ...],
     reference: Float[Array, "height width 3"],
-    given: Float[Array, "height width"],
+    base_weight: Float[Array, "height width"],
     is_robust: bool,
     descend_on: Callable[..., End],
 ) -> tuple[End, Float[Array, "height width"], Float[Array, "2"]]:
     """One round: an `End` whose unknowns are lights; the weights and the noise at that end."""
     _warn_of_what_does_not_move(model, lights)
     search = Search(model, lights, spread(model.gbuffer, model.camera))
-    unit = brightness(reference, given)
-    unknowns, weight, losses = search.unknowns(), given, []
+    unit = brightness(reference, base_weight)
+    unknowns, weight, losses = search.unknowns(), base_weight, []
     noise = jnp.full(2, jnp.inf, reference.dtype)
     is_last = not is_robust
     end = End(unknowns, [], verdict(optx.RESULTS.successful))
-    fitted = _lights(search, unknowns, reference, jnp.sqrt(given)[..., None])
+    fitted = _lights(search, unknowns, reference, jnp.sqrt(base_weight)[..., None])
     if is_robust:  # A lamp in the image, far off from the start, counts little from the first.
-        noise, weight = _reweighted(model, fitted, reference, given, noise, unit)
+        noise, weight = _reweighted(model, fitted, reference, base_weight, noise, unit)
     for left in reversed(range(_REWEIGHTINGS)):
         root = jnp.sqrt(weight)[..., None]
         is_last = is_last or left == 0
@@ -88,8 +88,8 @@ def search_once(
         fitted = _lights(search, unknowns, reference, root)
         if is_last or end.result != optx.RESULTS.successful:
             break
-        noise, again = _reweighted(model, fitted, reference, given, noise, unit)
-        is_last = bool(jnp.max(jnp.abs(again - weight)) < _SETTLED * jnp.max(given))
+        noise, again = _reweighted(model, fitted, reference, base_weight, noise, unit)
+        is_last = bool(jnp.max(jnp.abs(again - weight)) < _SETTLED * jnp.max(base_weight))
         weight = again
     square = unit.astype(float) ** 2
     end = End(tuple(fitted), [loss * square for loss in losses], end.result)
@@ -102,14 +102,14 @@ def _mean_square(residual, unknowns):
 
 
 @eqx.filter_jit
-def _reweighted(model, lights, reference, given, last, unit):
+def _reweighted(model, lights, reference, base_weight, last, unit):
     """The noise, no less than half of the `last`, and the weights that follow from it."""
-    length = lengths(model(lights) - reference, given)
+    length = lengths(model(lights) - reference, base_weight)
     is_reached = jnp.any(model.basis(lights) != 0, axis=(0, 3))
-    estimated = noise_of(length, jnp.where(is_reached, given, 0))
+    estimated = noise_of(length, jnp.where(is_reached, base_weight, 0))
     least = jnp.minimum(last, jnp.max(length, axis=(1, 2)) / CUT) / _EASE
     noise = jnp.maximum(jnp.maximum(estimated, least), LEAST_NOISE * unit)
-    return noise, given * biweight(length, noise)
+    return noise, base_weight * biweight(length, noise)
 
 
 def _lights(search, unknowns, reference, root):

@@ -39,24 +39,24 @@ _MOST_ERROR, _LEAST_EXPLAINED = 0.5, 0.5
 class DofFit(eqx.Module):
     """The lenses and the other parameters that `dof` found, and how sure they are.
 
-    - `lenses`: one for each picture, lengths in scene units.
+    - `lenses`: one for each photograph, lengths in scene units.
     - `gamma`, `epsilon`, `threshold`, `scale`, `shift`: the other parameters: a number, pixels
       twice, a ratio and inverse scene units. Parameters that were not sought, those of the
       other effect among them, are as given.
     - `footprint`: a ratio: how far small circles of confusion blur as discs do, which the
       sprites of the effect do not: 0 in images made by the effect, near 1 in others.
-    - `gain`, `offset`: picture channel, a ratio and units of radiance.
-    - `images`: picture height width channel: what the effect draws with the parameters, before
-      footprint, gain and offset.
+    - `gain`, `offset`: photograph channel, a ratio and units of radiance.
+    - `images`: photograph height width channel: the images that the effect draws with the
+      parameters, before footprint, gain and offset.
     - `losses`: the mean squared residual at the start and after every step, in squared units
       of radiance; it jumps where the search goes on with other lenses, sizes or weights.
     - `ends`: where the searches on small images ended, the best first: the parameters, in
       their units, and the `"loss"` of each.
-    - `standard_errors`: by the name of each fitted parameter, in its unit; one for each picture
-      where the parameter has one. From a jackknife: the residuals of 8 x 8 tiles of the image
-      are taken for independent of one another, and no others. Of lenses, `scale` and `shift`,
-      the variance by strata of like circles of confusion is added, in which an effect errs
-      alike. A parameter that the pictures do not determine has a large one, or inf.
+    - `standard_errors`: by the name of each fitted parameter, in its unit; one for each
+      photograph where it differs between them. From a jackknife: the residuals of 8 x 8 tiles
+      of the image are taken for independent of one another, and no others. Of lenses, `scale`
+      and `shift`, the variance by strata of like circles of confusion is added, in which an
+      effect errs alike. A parameter that the images do not determine has a large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
       pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
@@ -71,24 +71,24 @@ class DofFit(eqx.Module):
     scale: Float[Array, ""]
     shift: Float[Array, ""]
     footprint: Float[Array, ""]
-    gain: Float[Array, "picture channel"]
-    offset: Float[Array, "picture channel"]
-    images: Float[Array, "picture height width channel"]
+    gain: Float[Array, "photograph channel"]
+    offset: Float[Array, "photograph channel"]
+    images: Float[Array, "photograph height width channel"]
     losses: Float[Array, " steps"]
     ends: tuple[dict[str, Array], ...]
-    standard_errors: dict[str, Float[Array, "*picture"]]
+    standard_errors: dict[str, Float[Array, "*photograph"]]
     explained: Float[Array, ""]
     clamped: Float[Array, ""]
     result: optx.RESULTS
 
     @property
     def lens(self) -> ThinLens:
-        """The lens of the first picture."""
+        """The lens of the first photograph."""
         return self.lenses[0]
 
     @property
     def image(self) -> Float[Array, "height width channel"]:
-        """The first of the pictures, height width channel."""
+        """The first of the images, height width channel."""
         return self.images[0]
 
     @property
@@ -118,12 +118,12 @@ class DofFit(eqx.Module):
             return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
         untold = [name for name in self.untold if name in LENS + DISPARITY]
         if untold:
-            return f"The pictures do not tell {' and '.join(untold)}."
+            return f"The images do not determine {' and '.join(untold)}."
         return ""
 
     @property
     def success(self) -> bool:
-        """Whether the solver converged to a lens that the pictures determine."""
+        """Whether the solver converged to a lens that the images determine."""
         return not self.doubt
 
 
@@ -163,7 +163,7 @@ def dof(
     - `reference`: height width channel, linear radiance: a photograph or a multi-pass image;
       or a list of several of one scene.
     - `image`, `depth`: height width channel and height width, as in the effect.
-    - `lens`: where the search starts, lengths in scene units, one for each picture;
+    - `lens`: where the search starts, lengths in scene units, one for each photograph;
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
@@ -193,7 +193,7 @@ def dof(
 
     **Gradient:** none through the search: it stops at every step to report.
 
-    **Example:** two steps towards the lens of a blurred image.
+    **Example:** the aperture of a blurred image.
 
     >>> import numpy as np
     >>> from jaxfx import ThinLens, dof, fit
@@ -217,19 +217,19 @@ def dof(
     Source: Huber 1964, the loss; Golub & Pereyra 1973, exposure by variable projection. The
     noise near edges, the footprint and the lenses that are compared are our own.
     """
-    pictures, lenses = read.pictures(reference, image, depth, lens, behind, weights)
+    images, lenses = read.images(reference, image, depth, lens, behind, weights)
     read.options(effect=effect, loss=loss, tone=tone, exposure=exposure)
     max_steps = whole_number("dof(max_steps=...)", max_steps)
-    start = read.start(lenses, gamma, epsilon, threshold, pictures.image.dtype)
+    start = read.start(lenses, gamma, epsilon, threshold, images.image.dtype)
     names = read.names(effect, parameters)
     if max_coc is not None:
         is_diameter = lambda x: 0 < x < math.inf
         max_coc = number("dof(max_coc=...)", max_coc, is_diameter, "positive and finite")
-    read.check_moves(names, lenses, pictures, max_coc)
+    read.check_moves(names, lenses, images, max_coc)
     is_robust, is_free = loss == "robust", exposure == "free"
     if is_robust and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
-    model = Model(pictures, start, jnp.zeros(()), names, effect, 1.0)
+    model = Model(images, start, jnp.zeros(()), names, effect, 1.0)
     with Bar(progress, "fit") as bar:
         solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         residual = functools.partial(plain, exposure=is_free, tone=tone)
@@ -248,7 +248,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     variances = _variances(residual, end.unknowns, columns, rest)
     ones = jax.tree.map(jnp.ones_like, end.unknowns)
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
-    references = model.pictures.references
+    references = model.images.references
     is_single, is_plain = len(references) == 1, "footprint" not in model.names
     standard_errors = {}
     for name in (name for name in model.names if name != "footprint"):
@@ -260,7 +260,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     share = jnp.mean(jnp.isfinite(residual.scale).astype(contrast.dtype))
     names = ("gamma", "epsilon", "threshold", "scale", "shift", "footprint")
     return DofFit(
-        lenses=tuple(model.lens(values, picture) for picture in range(len(references))),
+        lenses=tuple(model.lens(values, photograph) for photograph in range(len(references))),
         gain=gain,
         offset=offset,
         images=drawn if is_plain else evaluate(without_footprint, end.unknowns)[1],

@@ -98,10 +98,10 @@ class LightsFit(eqx.Module):
             return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
         if self.indistinct:
             groups = ["lights " + " and ".join(map(str, group)) for group in self.indistinct]
-            return f"The picture can't tell apart {'; '.join(groups)}."
+            return f"The image can't tell apart {'; '.join(groups)}."
         if self.untold:
             names = [f"the {name} of light {index}" for index, name in self.untold]
-            return f"The picture does not tell {', '.join(names)}."
+            return f"The image does not determine {', '.join(names)}."
         return ""
 
     @property
@@ -199,7 +199,7 @@ def lights(
     """
     gbuffer = check_gbuffer("lights(gbuffer)", gbuffer)
     check_camera("lights(camera)", camera)
-    reference, gbuffer, given = _masked(_reference(reference, gbuffer), gbuffer, weights)
+    reference, gbuffer, base_weight = _masked(_reference(reference, gbuffer), gbuffer, weights)
     start = _start(lights)
     names, shape = _names(parameters, start), gbuffer.depth.shape
     option("lights(loss=...)", loss, get_args(Loss))
@@ -210,25 +210,25 @@ def lights(
         model, end, weight, noise = search_in_rounds(
             rounds,
             start,
-            lambda given: Model(gbuffer, camera, _entries(given, len(start), shape), names),
+            lambda entries: Model(gbuffer, camera, _entries(entries, len(start), shape), names),
             visibilities,
             lambda model, lights: search_once(
-                model, lights, reference, given, loss == "robust", descend_on
+                model, lights, reference, base_weight, loss == "robust", descend_on
             ),
         )
-    fitted = _fitted(model, end, reference, given, weight, noise)
+    fitted = _fitted(model, end, reference, base_weight, weight, noise)
     if throw:
         check_success(fitted, "lights", "lights")
     return fitted
 
 
 def _fitted(
-    model: Model, end: End, reference: Array, given: Array, weight: Array, noise: Array
+    model: Model, end: End, reference: Array, base_weight: Array, weight: Array, noise: Array
 ) -> LightsFit:
     """The result at the end of a search: lights, image, errors and quality."""
     lights = end.unknowns
     image, columns = linearized(model, lights)
-    quality = evidence(model, lights, columns, image, reference, given, weight, noise)
+    quality = evidence(model, lights, columns, image, reference, base_weight, weight, noise)
     return LightsFit(
         lights=lights,
         image=image,
@@ -256,16 +256,16 @@ def _masked(
 ) -> tuple[Array, GBuffer, Float[Array, "height width"]]:
     """Reference and cache, black where the cache shows no surface; the weights, 0 there."""
     is_shown = (gbuffer.depth > 0) & (gbuffer.depth < jnp.inf) & (gbuffer.shader >= 0)
-    given = is_shown.astype(reference.dtype)
+    base_weight = is_shown.astype(reference.dtype)
     if weights is not None:
         weights = check_depth("lights(weights=...)", weights, gbuffer.depth.shape)
         is_weight = lambda v: (np.isfinite(v) & (v >= 0)).all() and (v > 0).any()
         check("lights(weights=...)", weights, is_weight, "finite, 0 or positive, and not all 0")
-        given = given * weights.astype(given.dtype)
-    counts = given > 0
+        base_weight = base_weight * weights.astype(base_weight.dtype)
+    counts = base_weight > 0
     shader = jnp.where(counts, gbuffer.shader, -1)
     gbuffer = eqx.tree_at(lambda gbuffer: gbuffer.shader, gbuffer, shader)
-    return jnp.where(counts[..., None], reference, 0), gbuffer, given
+    return jnp.where(counts[..., None], reference, 0), gbuffer, base_weight
 
 
 def _start(lights: Any) -> tuple[Light, ...]:
@@ -290,8 +290,8 @@ def _names(parameters: Collection[str], lights: tuple[Light, ...]) -> tuple[str,
 def _entries(visibilities: Any, count: int, shape: tuple[int, ...]) -> tuple[Any, ...]:
     """The entries of `visibilities`, checked."""
     name = "lights(visibilities=...)"
-    given = [None] * count if visibilities is None else visibilities
-    entries = items(name, given, "a sequence of entries, or a function")
+    entries = [None] * count if visibilities is None else visibilities
+    entries = items(name, entries, "a sequence of entries, or a function")
     if len(entries) != count:
         raise ValueError(
             f"`lights(visibilities=...)` must have an entry for each of {count} lights, "

@@ -1,4 +1,4 @@
-"""What every plan promises, tried on random scenes of each effect."""
+"""The promises of a plan, tested on random scenes of each effect."""
 
 import itertools
 import statistics
@@ -24,16 +24,16 @@ class Promises(list):
         assert statistics.median(slack) < 4
 
 
-def of_pictures(result):
-    """The picture, without a coverage."""
+def of_images(result):
+    """The image of a result, without its coverage."""
     return result[0] if isinstance(result, tuple) else result
 
 
 @pytest.fixture
 def later_is_quicker(monkeypatch):
-    """Each way is said to be quicker than those before: the last within the error is taken."""
+    """Each candidate is quicker than those before: the last within the error is taken."""
     turns = itertools.count(1)
-    timed = lambda call, data: (of_pictures(call(*data)), 1 / next(turns))
+    timed = lambda call, data: (of_images(call(*data)), 1 / next(turns))
     monkeypatch.setattr(_search, "timed", timed)
 
 
@@ -43,7 +43,7 @@ def promised(is_full):
 
     There are 20 of them, or 200 with `--full`.
 
-    On pictures so small no time tells a way from another: whatever errs more is said to be
+    On images so small no time tells a candidate from another: whatever errs more is said to be
     quicker, and so the plan that is chosen is the one that comes nearest to its bound.
     """
 
@@ -51,16 +51,16 @@ def promised(is_full):
         rng, found, exact = np.random.default_rng(0), Promises(), {}
 
         def timed(call, data):
-            picture = of_pictures(call(*data))
-            error = _search.mean_square(picture - exact.setdefault(id(data), picture))
-            return picture, 1 / (1 + float(error))
+            image = of_images(call(*data))
+            error = _search.mean_square(image - exact.setdefault(id(data), image))
+            return image, 1 / (1 + float(error))
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(_search, "timed", timed)
             for _ in range(200 if is_full else 20):
                 data, allowed = scene(rng), 10 ** rng.uniform(*exponents)
                 chosen = plan(*data, max_error=allowed)
-                difference = of_pictures(chosen(*data)) - of_pictures(effect(*data))
+                difference = of_images(chosen(*data)) - of_images(effect(*data))
                 found.append((chosen, allowed, float(_search.mean_square(difference)) ** 0.5))
                 exact.clear()
         return found

@@ -14,7 +14,7 @@ CAMERA, LENS = PinholeCamera.from_fov(1.0, height=2, width=2), ThinLens(0.5, 2.0
 
 
 def waves(rng):
-    """Pictures that are waves over the lens, and their means: 2 J1(k r) / (k r)."""
+    """Images that are waves over the lens, and their means: 2 J1(k r) / (k r)."""
     waves = rng.uniform(-40, 40, (2, 12))
     length = np.hypot(*waves) * 0.25
     mean = 2 * scipy.special.j1(length) / length

@@ -1,4 +1,4 @@
-"""Plans for depth of field: they hold what they promise, and say what they leave out."""
+"""Plans for depth of field: their errors hold, and they name what they leave out."""
 
 import importlib
 import inspect
@@ -13,7 +13,7 @@ from jaxfx import FocusPlanes, ThinLens, budget, dof
 from jaxfx.budget.dof import Method, _parts
 
 
-# Of most pictures here, and of the parts of those that have some.
+# The size of most images here, and of the parts of larger ones.
 SIZE = (10, 10)
 
 
@@ -35,7 +35,7 @@ def scene(rng, widest, size=SIZE):
 
 @pytest.fixture(scope="module")
 def plans(promised):
-    """Of pictures just large enough that parts of them are looked at first."""
+    """Of images just large enough that candidates are tried on parts of them."""
     sizes = {0.9: 1.0, 9.9: 10.0}
 
     def full(image, depth, lens):

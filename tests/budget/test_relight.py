@@ -44,7 +44,7 @@ def scene(rng):
 
 @pytest.fixture(scope="module")
 def plans(promised):
-    """Of pictures just large enough that merged lights are tried in some of their pixels."""
+    """Of images just large enough that merged lights are tried in some of their pixels."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"_EVERY": 4, "_MANY": 128}.items():
             patch.setattr(importlib.import_module("jaxfx.budget.relight"), name, value)
@@ -68,7 +68,7 @@ def test_a_plan_names_the_lights_that_it_drops():
 
 @pytest.mark.full
 def test_lights_are_computed_where_they_are_needed():
-    """Against the picture of each light times the pixels that it is for."""
+    """Against the image of each light times the pixels that it is drawn in."""
     rng = np.random.default_rng(2)
     cache, camera, lights = scene(rng)
     visibilities = [rng.uniform(0, 1, SIZE), None, rng.uniform(0, 1, SIZE), None]

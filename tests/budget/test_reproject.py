@@ -15,7 +15,7 @@ SIZE = (10, 12)
 
 
 def along(x):
-    """A camera of the scene, moved by so much to the right."""
+    """A camera of the scene, moved to the right by `x`."""
     pose = np.eye(4)
     pose[0, 3] = x
     height, width = SIZE
@@ -67,7 +67,7 @@ def test_a_plan_knows_what_the_effect_knows(later_is_quicker):
 
 @pytest.mark.full
 def test_rays_that_show_nothing_are_cut_short(later_is_quicker):
-    """Between posts they go on, out of the picture; and nobody misses what they would show."""
+    """Between posts they go on, out of the image, and no pixel needs what they would show."""
     posts = np.where(np.arange(SIZE[1]) % 6 < 1, 2.0, 6.0) * np.ones(SIZE)
     image = np.random.default_rng(1).random((*SIZE, 1))
     data = [image], [posts], [along(0.0)], along(2.0)
@@ -77,10 +77,10 @@ def test_rays_that_show_nothing_are_cut_short(later_is_quicker):
         np.testing.assert_array_equal(own, exact)
 
     @eqx.filter_jit
-    def slopes(way, depth, tangent):
-        picture = lambda depth: way(data[0], [depth], *data[2:])[0]
-        pulled = jax.vjp(picture, depth)[1](jnp.ones((*SIZE, 1)))[0]
-        return pulled, jnp.sum(jax.jvp(picture, (depth,), (tangent,))[1])
+    def slopes(call, depth, tangent):
+        image = lambda depth: call(data[0], [depth], *data[2:])[0]
+        pulled = jax.vjp(image, depth)[1](jnp.ones((*SIZE, 1)))[0]
+        return pulled, jnp.sum(jax.jvp(image, (depth,), (tangent,))[1])
 
     tangent = np.random.default_rng(0).normal(size=SIZE)
     pulled, pushed = slopes(plan, posts, tangent)

@@ -1,4 +1,4 @@
-"""What is spent tile by tile, and the blocks that are left."""
+"""An error spent tile by tile, and the blocks of pixels that are left."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Where fits fail. Lights: pictures that no model of them makes, and lights that are as one."""
+"""Cases in which fits fail: images that the model of lights lacks, lights that are as one."""
 
 import functools as ft
 
@@ -14,8 +14,8 @@ COUNT = 8
 
 
 def _lit(change, loss, **options):
-    """Of so many fits: the largest median miss of a place or a direction, in scene units and
-    radians; the share of numbers that lie outside of 1.96 stated errors; that of failures."""
+    """Over `COUNT` fits: the median of the largest error of a position or direction, in scene
+    units and radians; the share of numbers outside of 1.96 stated errors; that of failures."""
     off, outside, failures = [], [], []
     image = weight = np.zeros((1, 1, 3))
     for seed in range(COUNT):
@@ -43,8 +43,8 @@ NONE = "none: a search stops at every step to report"
 
 @case("fit", ASKED, LOSSES, NONE)
 def lights_as_the_model_has_them(loss):
-    """A sun and a lamp 10 degrees and a quarter unit off at the start, noise of 1 %; 8 pictures
-    of 32 x 32: the median of the largest miss of a place (scene units) or a direction
+    """A sun and a lamp 10 degrees and a quarter unit off at the start, noise of 1 %; 8 images
+    of 32 x 32: the median of the largest error of a position (scene units) or direction
     (radians); the share of numbers outside of 1.96 stated errors; the share that is doubted."""
     return _lit(ft.partial(lit.problem, spheres=0), loss)
 
@@ -57,8 +57,8 @@ def lights_and_shadows_that_the_model_lacks(loss):
 
 @case("fit", ASKED, LOSSES, NONE)
 def lights_and_saturated_highlights(loss):
-    """The same without spheres, clipped above the brightness that a tenth of the numbers
-    pass."""
+    """The same without spheres, clipped above the brightness that a tenth of the values
+    exceed."""
 
     def clipped(seed):
         image, truth, start = lit.problem(seed, spheres=0)
@@ -85,7 +85,7 @@ def lights_in_a_picture_of_wrong_exposure(loss):
 
 @case("fit", {"successes": 0.0, "finite": 0.0}, LOSSES, NONE)
 def lights_that_cannot_be_told_apart(loss):
-    """Two suns half a degree apart, 10 degrees apart at the start, noise of 1 %; 8 pictures:
+    """Two suns half a degree apart, 10 degrees apart at the start, noise of 1 %; 8 images:
     the share that is called a success, and that of colours with a finite stated error."""
     successes, finite = [], []
     truth = [DirectionalLight([0.3, y, 1.0], np.ones(3)) for y in (0.2, 0.21)]

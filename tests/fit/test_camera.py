@@ -1,4 +1,4 @@
-"""The pose of a rendered view is found again; what is wrong with the arguments is said."""
+"""`fit.camera`: the pose of a rendered view is recovered; wrong arguments are named."""
 
 import functools
 import inspect
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, fit, relight, scene
-from jaxfx.fit import _pose_residual as _pose
+from jaxfx.fit import _pose_residual
 from tests.cases import rooms
 from tests.helpers.forms import first
 
@@ -79,7 +79,7 @@ def test_a_rendered_views_pose_is_recovered(seed):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("hole", [0.0, -1.0, np.nan, np.inf])
 @pytest.mark.full
-def test_one_hole_in_the_depth_has_no_say(hole, dtype):
+def test_one_hole_in_the_depth_does_not_count(hole, dtype):
     y, x = np.mgrid[:32, :32] / 32
     image = np.stack([np.sin(9 * x + 3 * y), np.cos(7 * y), np.sin(5 * x * y)], -1) / 2 + 0.5
     eye = PinholeCamera.from_fov(1.0, height=32, width=32)
@@ -115,7 +115,7 @@ def test_a_pose_is_recovered_from_a_depth_with_holes():
 
 
 @pytest.mark.full
-def test_failure_is_said():
+def test_failure_is_stated():
     reference, image, depth, source, true = pictures()
     away = moved(true, (0, 1, 0), 180.0, (0, 0, 0))
     with pytest.raises(RuntimeError, match=r"found no pose .*: Both see only 0 % of"):
@@ -183,7 +183,7 @@ def pairs(count):
 
 
 @pytest.mark.full
-def test_success_is_what_the_images_tell_and_errors_are_of_the_size_that_is_stated():
+def test_success_means_a_right_pose_and_errors_are_of_the_size_that_is_stated():
     """Rooms, seen twice with 0 to 100 % in common, exposed apart and with noise."""
     count, false_alarms, missed, within = 60, 0, 0, []
     for found, angle, distance in pairs(count):
@@ -208,18 +208,20 @@ def test_the_residual_has_the_derivative_of_its_difference_quotient():
     second = first @ rooms.pose(0.02, 0.01, np.array([0.03, 0.01, 0.02]))
     reference, own, target = rooms.seen(place, second, size, fov=0.7)
     arrays = [jnp.asarray(x, float) for x in (1.2 * reference, own, image, depth)]
-    views = _pose.Views(*arrays, source, target)
-    clear = _pose.clear_of_steps(views.depth, 0.1)
+    views = _pose_residual.Views(*arrays, source, target)
+    clear = _pose_residual.clear_of_steps(views.depth, 0.1)
     # With this scale no difference is beyond the corner of Huber's loss.
-    model = _pose.Residual(
+    model = _pose_residual.Residual(
         views, clear, jnp.ones(6), jnp.ones(2), hole_threshold=0.1, exposure=True, stride=1
     )
     twist = jnp.asarray(np.random.default_rng(0).normal(size=6) * 1e-3)
-    columns, residual, found = _pose.report(model, twist)
+    columns, residual, found = _pose_residual.report(model, twist)
     assert float(found.counts.mean()) > 0.3
     step = 1e-6
     for i, along in enumerate(np.eye(6)):
-        ends = [_pose.report(model, twist + sign * step * along)[1] for sign in (1, -1)]
+        ends = [
+            _pose_residual.report(model, twist + sign * step * along)[1] for sign in (1, -1)
+        ]
         quotient = np.asarray(ends[0] - ends[1]).reshape(-1) / (2 * step)
         differs = np.abs(quotient - columns[:, i]) > 1e-4 * np.abs(columns[:, i]).max()
         # A ray that goes from one texel to the next changes the surface that it reads.
@@ -234,7 +236,7 @@ def test_the_residual_has_the_derivative_of_its_difference_quotient():
 def test_depth_of_its_own_makes_the_pose_surer():
     reference, image, depth, source, own, true = taken(3, 0.15, np.array([0.1, 0.02, 0.05]))
     own = own.copy()
-    own[20:30, 30:40] = 0  # What is missing has no say.
+    own[20:30, 30:40] = 0  # Missing depth does not count.
     plain = fit.camera(reference, image, depth, source, source)
     found = fit.camera(reference, image, depth, source, source, reference_depth=own)
     angle, distance = apart(found.camera, true)

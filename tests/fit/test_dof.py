@@ -1,4 +1,4 @@
-"""The fit of scatter: what made a picture is found in it; what can't be found is said."""
+"""`fit.dof`: the lens that drew an image is recovered from it; failures are stated."""
 
 import functools
 import inspect
@@ -109,7 +109,7 @@ def test_the_threshold_of_layered_scatter_is_found():
 
 @pytest.mark.full
 def test_a_lens_that_no_derivative_moves_may_be_held():
-    """Below a pixel it can't be found, but what else there is can be."""
+    """Circles below a pixel show no lens, but the other parameters can be fitted."""
     image, depth = still_life(16)
     lens = ThinLens(1e-3, 3.0, 120.0)
     how = {"parameters": ("gamma",), "max_coc": 2.0, "throw": False}
@@ -129,14 +129,14 @@ def test_losses_open_with_the_start_and_the_image_is_the_fitted_one():
 
 
 @pytest.mark.full
-def test_a_search_that_runs_out_of_room_goes_on_with_more():
+def test_a_search_whose_circles_outgrow_the_bound_goes_on_with_a_larger_one():
     fitted = quietly(*picture(), wrong((0, 0, 1, 1)), max_coc=None)
     assert fitted.success and fitted.clamped == 0
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
 
 
 @pytest.mark.full
-def test_says_what_was_clamped():
+def test_the_share_of_clamped_pixels_is_reported():
     reference, image, depth = picture()
     fitted = quietly(reference, image, depth, parameters=("gamma",), max_coc=3.5)
     share = np.mean(fitted.lens.circle_of_confusion(jnp.asarray(depth)) > 3.5)
@@ -181,7 +181,7 @@ def test_any_solver_or_minimiser(solver):
 
 
 @pytest.mark.full
-def test_failure_is_said():
+def test_failure_is_stated():
     start = wrong((0, 1, 0, 1))
     said = r"found no l\w+ in \d+ steps.*from [\de.-]+ to [\de.-]+"
     with pytest.raises(RuntimeError, match=said):
@@ -194,7 +194,7 @@ def test_failure_is_said():
 
 
 def behind_the_focus():
-    """A textured plane far behind the focus, where neither visibility has a say."""
+    """A textured plane far behind the focus, where gamma and epsilon change nothing."""
     image, _ = still_life()
     depth = np.full(image.shape[:2], 9.0)
     values = TRUTH | {"epsilon": 1.0}
@@ -214,9 +214,9 @@ def test_a_solver_that_breaks_down_leaves_what_it_had():
 
 
 @pytest.mark.full
-def test_what_the_picture_cannot_tell_is_uncertain():
+def test_what_the_image_does_not_determine_has_a_large_error():
     fitted = quietly(*behind_the_focus(), throw=False)
-    assert not fitted.success and "do not tell aperture" in fitted.doubt
+    assert not fitted.success and "do not determine aperture" in fitted.doubt
     assert fitted.untold == fit.PARAMETERS
     assert fitted.standard_errors["gamma"] == fitted.standard_errors["epsilon"] == np.inf
     # One plane has one circle of confusion: the aperture or the focus may have made it.
@@ -226,7 +226,7 @@ def test_what_the_picture_cannot_tell_is_uncertain():
 
 
 @pytest.mark.full
-def test_uncertainty_is_the_spread_over_draws_of_noise():
+def test_standard_errors_are_the_spread_over_draws_of_noise():
     reference, image, depth = picture()
     rng = np.random.default_rng(2)
     misses = []
@@ -242,7 +242,7 @@ def test_uncertainty_is_the_spread_over_draws_of_noise():
 
 
 @pytest.mark.full
-def test_what_has_no_weight_has_no_say():
+def test_pixels_without_weight_do_not_count():
     """A quarter of the reference is of another lens; with weights it does not matter."""
     reference, image, depth = picture()
     spoiled, weights = np.array(reference), np.ones((SIZE, SIZE))
@@ -287,7 +287,7 @@ FAULTS = {
     "dof(tone=...)": {"tone": "gamma"},
     "dof(exposure=...)": {"exposure": 1.0},
     "dof(ratios=...) must name some": {"ratios": ("gamma",)},
-    "dof(lens) must be one for each of 2 pictures": {
+    "dof(lens) must be one for each of 2 photographs": {
         "reference": [np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3))]
     },
     "dof(reference[1]) must have the image's shape": {
@@ -339,7 +339,7 @@ def test_wrong_pixels_do_not_decide():
     fitted = quietly(spoiled, image, depth, wrong((0, 1, 1, 0)), throw=False)
     assert found(fitted) == pytest.approx(TRUTH, rel=0.02)
     assert fitted.explained == pytest.approx(np.mean(spoiled < 20), abs=1e-3)
-    # The searches are told, the best first, and none is better.
+    # The ends of the searches are reported, the best first.
     ends = [float(end["aperture"][0]) for end in fitted.ends]
     assert ends[0] == pytest.approx(TRUTH["aperture"], rel=0.02) and len(ends) >= 3
 
@@ -360,7 +360,7 @@ def test_gain_and_offset_are_found_beside_the_lens():
 
 
 def focus_pull(foci):
-    """Pictures through one aperture at several focus distances, and their lenses."""
+    """Images through one aperture at several focus distances, and their lenses."""
     _, image, depth = picture()
     lenses = [ThinLens(0.12, focus, 120.0) for focus in foci]
     amplified = {"gamma": TRUTH["gamma"], "epsilon": TRUTH["epsilon"], "max_coc": 8.0}
@@ -368,7 +368,7 @@ def focus_pull(foci):
 
 
 @pytest.mark.full
-def test_known_lenses_tell_scale_and_shift_of_disparity():
+def test_known_lenses_determine_scale_and_shift_of_disparity():
     pictures, lenses = focus_pull((3.0, 5.0))
     _, image, depth = picture()
     given = 1 / ((1 / depth + 0.02) / 1.2)  # 1 / depth is 1.2 / given - 0.02
@@ -385,7 +385,7 @@ def test_known_lenses_tell_scale_and_shift_of_disparity():
 
 
 @pytest.mark.full
-def test_one_picture_does_not_tell_a_lens_and_disparity_at_once():
+def test_one_image_does_not_determine_a_lens_and_disparity_at_once():
     """The defocus is aperture x (1 / focus - scale / depth - shift): four numbers for two."""
     _, image, depth = picture()
     values = TRUTH | {"gamma": 0.0}
@@ -397,7 +397,7 @@ def test_one_picture_does_not_tell_a_lens_and_disparity_at_once():
 
 
 @pytest.mark.full
-def test_several_pictures_tell_one_aperture():
+def test_several_images_determine_one_aperture():
     pictures, lenses = focus_pull((2.5, 4.0))
     _, image, depth = picture()
     starts = [ThinLens(0.09, 1.15 * lens.focus_distance, 120.0) for lens in lenses]

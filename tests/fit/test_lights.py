@@ -177,7 +177,7 @@ def test_a_light_that_reaches_nothing():
     lights = (*SUNS[:2], PointLight([0.0, 0.0, 9.0], WHITE))
     reference = relight.render(cache(), CAMERA, SUNS)
     fitted = colors_of(reference, cache(), lights, throw=False)
-    assert fitted.doubt == "The picture does not tell the color of light 2."
+    assert fitted.doubt == "The image does not determine the color of light 2."
     assert fitted.lights[2].color.tolist() == [0, 0, 0]
     assert fitted.standard_errors[2]["color"].tolist() == [np.inf] * 3
     assert np.isfinite(fitted.standard_errors[1]["color"]).all()
@@ -228,7 +228,7 @@ def test_suns_over_a_matt_hill_are_dependent_but_for_three():
 
 
 @pytest.mark.full
-def test_uncertainty_is_the_spread_over_draws_of_noise():
+def test_standard_errors_are_the_spread_over_draws_of_noise():
     reference = relight.render(cache(), CAMERA, SUNS)
     rng = np.random.default_rng(2)
     misses = []

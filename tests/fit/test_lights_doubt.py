@@ -152,7 +152,7 @@ def test_suns_that_are_nearly_one_are_doubted(gap):
         truth = [DirectionalLight([0.3, y, 1.0], WHITE) for y in (0.2, 0.2 + gap)]
         found = fitted_to(grainy(truth, seed), start)
         assert found.indistinct == ((0, 1),) and found.explained > 0.99
-        assert found.doubt == "The picture can't tell apart lights 0 and 1."
+        assert found.doubt == "The image can't tell apart lights 0 and 1."
         assert all(np.isinf(errors["color"]).all() for errors in found.standard_errors)
     truth = [DirectionalLight([x, 0.2, 1.0], WHITE) for x in (0.0, 0.6)]
     assert fitted_to(grainy(truth), start).success

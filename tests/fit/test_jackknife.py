@@ -1,4 +1,4 @@
-"""What fits share: the loss and the covariance, against closed forms and plain loops."""
+"""Huber's loss and the jackknife, which fits share, against closed forms and plain loops."""
 
 import jax
 import jax.numpy as jnp
