@@ -38,7 +38,7 @@ def clean(
 
     >>> import numpy as np
     >>> from jaxfx import depth
-    >>> depth.clean(np.array([[0, 1500]], np.uint16), scale=1 / 1000)  # millimetres to metres
+    >>> depth.clean(np.array([[0, 6]], np.uint16), scale=1 / 4)  # steps of a quarter metre
     Array([[nan, 1.5]], dtype=float32)
 
     **Arguments:**
