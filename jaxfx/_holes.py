@@ -88,7 +88,7 @@ def cheapest_sources(
     ]
     # Rotated by a quarter turn for each of the four directions from which a step can come.
     rotated = [[jnp.rot90(plane, turns) for plane in planes] for turns in range(4)]
-    steps = [_steps_down(*rotated_planes, unit) for rotated_planes in rotated]
+    steps = [_steps_down(image, log, limit, unit) for image, log, limit in rotated]
     is_known = ~jnp.isnan(depth)
     source = jnp.arange(height * width).reshape(height, width)
     paths = jnp.where(is_known, 0, jnp.inf).astype(depth.dtype), source
@@ -131,7 +131,7 @@ def _steps_down(
 
 
 def _swept_down(paths: Paths, steps: Float[Array, "height 3 width"]) -> Paths:
-    """The paths after each row, from the first on, has taken cheaper ones from the row above."""
+    """The paths after each row in turn has taken the cheaper ones from the row above."""
 
     def row(above, here):
         (cost, source), step = here

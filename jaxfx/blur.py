@@ -342,7 +342,7 @@ def _gaussian_pass(
 
 @ft.partial(_gaussian_pass.defjvp, symbolic_zeros=True)
 def _(sampling, taps, passes, primals, tangents):
-    # The derivative by `sigma` is one image. By way of the weights it would be one per tap.
+    # The derivative by `sigma` is one image. Through the weights it would be one per tap.
     (image, sigma), (image_dot, sigma_dot) = primals, tangents
     out = _gaussian_pass(sampling, taps, passes, image, sigma)
     weights_of = lambda sigma: _gaussian_weights(taps, sigma, passes).astype(image.dtype)

@@ -75,8 +75,8 @@ def clean(
     check("clean(scale=...)", scale, lambda v: (v > 0) & np.isfinite(v), "positive and finite")
     values, is_background = _numbers_and_sky("clean(depth)", depth, sky)
     is_known = (values > 0) & ~is_background
-    known = jnp.where(is_known, values, 1) * scale.astype(values.dtype)
-    return _with_holes(known, is_known, is_background)
+    safe_depth = jnp.where(is_known, values, 1) * scale.astype(values.dtype)
+    return _with_holes(safe_depth, is_known, is_background)
 
 
 def from_disparity(
@@ -119,8 +119,8 @@ def from_disparity(
     is_number = jnp.isfinite(values)
     inverse_depth = jnp.where(is_number, values, 1) * scale + shift
     is_known = is_number & (inverse_depth > 0) & jnp.isfinite(inverse_depth)
-    known = 1 / jnp.where(is_known, inverse_depth, 1)
-    return _with_holes(known, is_known, is_number & (inverse_depth == 0))
+    safe_depth = 1 / jnp.where(is_known, inverse_depth, 1)
+    return _with_holes(safe_depth, is_known, is_number & (inverse_depth == 0))
 
 
 def from_stereo(
@@ -171,8 +171,8 @@ def from_stereo(
     shifted = jnp.where(is_match, values, 1) + offset
     is_known = is_match & (shifted > 0)
     product = focal.astype(values.dtype) * base.astype(values.dtype)
-    known = product / jnp.where(is_known, shifted, 1)
-    return _with_holes(known, is_known, jnp.zeros_like(is_known))
+    safe_depth = product / jnp.where(is_known, shifted, 1)
+    return _with_holes(safe_depth, is_known, jnp.zeros_like(is_known))
 
 
 def from_ray_distance(
@@ -208,10 +208,10 @@ def from_ray_distance(
     check_camera("from_ray_distance(camera)", camera)
     values, is_background = _numbers_and_sky("from_ray_distance(distance)", distance, None)
     is_known = (values > 0) & ~is_background
-    known = jnp.where(is_known, values, 1)
+    safe_depth = jnp.where(is_known, values, 1)
     if isinstance(camera, PinholeCamera):
-        known = known * _axis_per_ray(camera, values)
-    return _with_holes(known, is_known, is_background)
+        safe_depth = safe_depth * _axis_per_ray(camera, values)
+    return _with_holes(safe_depth, is_known, is_background)
 
 
 def _axis_per_ray(
@@ -348,9 +348,9 @@ def _numbers_and_sky(
 
 
 def _with_holes(
-    known: Float[Array, "height width"],
+    depth: Float[Array, "height width"],
     is_known: Bool[Array, "height width"],
     is_background: Bool[Array, "height width"],
 ) -> Float[Array, "height width"]:
-    """`known` where `is_known`, inf for background, NaN elsewhere."""
-    return jnp.where(is_known, known, jnp.where(is_background, jnp.inf, jnp.nan))
+    """`depth` where `is_known`, inf for background, NaN elsewhere."""
+    return jnp.where(is_known, depth, jnp.where(is_background, jnp.inf, jnp.nan))

@@ -1,4 +1,4 @@
-"""The light that many lights bring to a surface, as sums from which a light can be taken again.
+"""Sums of many lights' terms per pixel, to which a light can be added or taken out again.
 
 Two things keep long chains of edits exact. The sums are compensated: what rounding loses is
 summed up beside them. And a light is added and taken out by one compiled loop, so both terms

@@ -28,11 +28,11 @@ class FilledCache(NamedTuple):
     """A cache whose holes are filled, and how many there were.
 
     - `gbuffer`: the `GBuffer`, height width; its depth is unchanged.
-    - `count`: a scalar integer, the number of pixels that were filled.
+    - `hole_count`: a scalar integer, the number of pixels that were filled.
     """
 
     gbuffer: GBuffer
-    count: Int[Array, ""]
+    hole_count: Int[Array, ""]
 
 
 def fill_holes(gbuffer: GBuffer, views: Int[ArrayLike, "height width"]) -> FilledCache:
@@ -47,8 +47,8 @@ def fill_holes(gbuffer: GBuffer, views: Int[ArrayLike, "height width"]) -> Fille
     - `views`: height width, integers, from `synthesize`: how many caches show each pixel. A
       hole has 0.
 
-    **Returns:** a `FilledCache` of `gbuffer` and `count`. Where no pixel at all is covered,
-    nothing is filled and the count is 0.
+    **Returns:** a `FilledCache` of `gbuffer` and `hole_count`. Where no pixel at all is
+    covered, nothing is filled and the count is 0.
 
     **Raises:** `ValueError` for `views` of another shape.
 
@@ -62,8 +62,8 @@ def fill_holes(gbuffer: GBuffer, views: Int[ArrayLike, "height width"]) -> Fille
     >>> depth = jnp.ones((8, 8))
     >>> gbuffer = GBuffer(image, shader, image, image, image, image, depth, depth)
     >>> views = shader.at[:, 4].set(1)  # Only the fifth column is covered.
-    >>> filled, count = relight.fill_holes(gbuffer, views)
-    >>> int(count), float(filled.color.min())
+    >>> filled, hole_count = relight.fill_holes(gbuffer, views)
+    >>> int(hole_count), float(filled.color.min())
     (56, 1.0)
 
     Source: Kim, Lee & Kyung leave the filling open; the nearest pixel is found as by Saito &
@@ -93,8 +93,8 @@ def _fill(gbuffer, views):
         return jnp.where(mask, copied, field)
 
     fields = {name: filled(value) for name, value in vars(gbuffer).items() if name != "depth"}
-    count = jnp.sum(is_hole, dtype=jnp.int32)
-    return FilledCache(GBuffer(depth=gbuffer.depth, **fields), count)
+    hole_count = jnp.sum(is_hole, dtype=jnp.int32)
+    return FilledCache(GBuffer(depth=gbuffer.depth, **fields), hole_count)
 
 
 def _nearest_covered(is_covered: _Mask, is_hole: _Mask) -> tuple[_Mask, _Integers]:

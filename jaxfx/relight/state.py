@@ -37,8 +37,7 @@ def start(
 ) -> "RelightState":
     """Shade every light once, and keep what an edit of one of them needs.
 
-    Returns a state whose `image` is the picture; `edit`, `add`, `remove` and `paint` return
-    new states.
+    Its `image` is `render`'s; `edit`, `add`, `remove` and `paint` return a new state each.
 
     **Arguments:**
 
