@@ -46,7 +46,7 @@ from jaxfx._filter import (
 from jaxfx._numerics import working_dtype
 
 
-__all__ = ["Reads", "binomial_weights", "downsample", "gaussian", "linear_taps"]
+__all__ = ["LinearTaps", "binomial_weights", "downsample", "gaussian", "linear_taps"]
 
 # Pixels squared. A smaller variance counts as this, so that it can divide. The neighbours'
 # weights are then e**-500, 0 in float32; with a larger value a sigma near 0 would still blur.
@@ -57,11 +57,11 @@ _LEAST_VARIANCE = 1e-3
 _DEFAULT_TAPS, _COVERED_DEVIATIONS = 9, 4
 
 
-class Reads(NamedTuple):
-    """Reads between pixels that replace the taps of a filter, sorted by offset.
+class LinearTaps(NamedTuple):
+    """Reads between pixels that replace the taps of a filter, in ascending order.
 
     - `offsets`: reads; pixels from the filter's middle.
-    - `weights`: reads; a ratio, of the sum that the filter's weights have.
+    - `weights`: reads; ratios, whose sum is that of the filter's weights.
     """
 
     offsets: Float[Array, "reads"]
@@ -199,7 +199,7 @@ def binomial_weights(taps: WholeNumber, *, row: WholeNumber) -> Float[Array, "ta
 
 def linear_taps(
     tap_weights: Float[ArrayLike, "taps"],
-) -> Reads:
+) -> LinearTaps:
     """Half as many reads, between the pixels by linear interpolation, for the same sum.
 
     For a shader: a texture unit interpolates for free.
@@ -208,8 +208,8 @@ def linear_taps(
     middle is at offset 0: on a pixel for an odd number of taps, between two pixels for an even
     one.
 
-    **Returns:** `Reads` of `offsets`, in pixels from the middle, ascending, and `weights`. A
-    pair of weight 0, or below 3e-10 in float32 and 1e-77 in float64, is read at its first
+    **Returns:** `LinearTaps` of `offsets`, in pixels from the middle, ascending, and `weights`.
+    A pair of weight 0, or below 3e-10 in float32 and 1e-77 in float64, is read at its first
     pixel.
 
     **Raises:** `ValueError` for weights that are not a vector of floats, or where one is
@@ -241,7 +241,7 @@ def linear_taps(
     reads = linear_reads(array)
     middle = (array.size - 1) / 2
     offsets = jnp.stack([first - middle + share for first, share, _ in reads])
-    return Reads(offsets, jnp.stack([weight for _, _, weight in reads]))
+    return LinearTaps(offsets, jnp.stack([weight for _, _, weight in reads]))
 
 
 def downsample(

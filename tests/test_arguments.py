@@ -520,7 +520,7 @@ def test_no_function_is_forgotten():
         "Candidates",
         "Lens",
     }
-    records |= {"Filled", "FilledCache", "Reads"}
+    records |= {"Filled", "FilledCache", "LinearTaps"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

@@ -135,7 +135,7 @@ def test_an_earlier_run_is_drawn_again(out, tmp_path, monkeypatch, capsys):
 PARTS = {
     *("Accumulation", "binomial_weights", "linear_taps", "Candidates", "Receivers"),
     *("candidates", "receivers", "light_cameras", "Choice", "Hit", "choose"),
-    *("RelightState", "Synthesis", "FilledCache", "Reads", "capture_normals", "shade"),
+    *("RelightState", "Synthesis", "FilledCache", "LinearTaps", "capture_normals", "shade"),
 }
 
 
