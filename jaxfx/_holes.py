@@ -1,7 +1,7 @@
-"""Which known pixel each missing one copies its depth from.
+"""Holes in a depth map: from which known pixel each missing one copies its depth.
 
-Depths are height width, NaN where missing, positive or inf elsewhere; a source is the index of
-a pixel, row by row. A known pixel is its own source.
+Used by `jaxfx.depth.fill`. Depths are height width: NaN where missing, positive or inf
+elsewhere. A source is the flat index of a pixel; a known pixel is its own source.
 """
 
 import functools
@@ -11,34 +11,37 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
-# In units of the image's longer side: what a step across all of the guide's range costs, and
-# what a path pays at the rim of the hole for each factor of e by which its depth is too near.
+# Costs of a path, in units of the image's longer side, so that they do not depend on the
+# resolution. Both were found by trial. `EDGE`: of a step over the guide's whole range. With
+# less, depths leak over edges of the guide; with more, its noise stops paths. `NEARER`: at the
+# rim of a hole, per factor of e by which the depth is nearer than expected. With less,
+# foreground grows into holes; with more, the guide no longer matters.
 EDGE = 1.25
 NEARER = 0.25
-# How often filled pixels take the median of their neighbours.
+# Passes of a 3 x 3 median over the filled pixels. With none, single pixels stand out.
 MEDIANS = 2
 
 Plane = Float[Array, "height width"]
 Source = Int[Array, "height width"]
-# What the path to each pixel costs, and where it comes from.
+# The cost of the cheapest path to each pixel found so far, and the source at its start.
 Paths = tuple[Plane, Source]
 
 
 @jax.jit
 def farther_ends(depth: Plane) -> Source:
-    """The farther end of each gap in its row; in a row that knows nothing, in its column.
+    """The farther end of each gap in its row; in a row without any depth, in its column.
 
-    Where a depth is known nowhere, pixels are their own sources.
+    Where no depth is known at all, pixels are their own sources.
     """
     height, width = depth.shape
     index = jnp.arange(height * width).reshape(height, width)
     along_rows = _farther_end(depth, index)
-    whole_rows = depth.reshape(-1)[along_rows]
-    return _farther_end(whole_rows.T, along_rows.T).T
+    depth_by_rows = depth.reshape(-1)[along_rows]
+    return _farther_end(depth_by_rows.T, along_rows.T).T
 
 
 def _farther_end(depth: Plane, source: Source) -> Source:
-    """The `source` of each pixel; in a gap of a row, that of the farther of its two ends."""
+    """`source`, but in a gap of a row the source of the farther of the gap's two ends."""
     width = depth.shape[1]
     is_known = ~jnp.isnan(depth)
     column = jnp.arange(width)[None]
@@ -46,9 +49,11 @@ def _farther_end(depth: Plane, source: Source) -> Source:
     behind = jax.lax.cummin(jnp.where(is_known, column, width), axis=1, reverse=True)
 
     def end(columns: Source, exists: Bool[Array, "height width"]) -> tuple[Plane, Source]:
-        held = jnp.clip(columns, 0, width - 1)
-        found = jnp.take_along_axis(depth, held, axis=1)
-        return jnp.where(exists, found, -jnp.inf), jnp.take_along_axis(source, held, axis=1)
+        """Depth and source at the ends in `columns`; depth -inf where there is no end."""
+        inside = jnp.clip(columns, 0, width - 1)
+        end_depth = jnp.take_along_axis(depth, inside, axis=1)
+        end_source = jnp.take_along_axis(source, inside, axis=1)
+        return jnp.where(exists, end_depth, -jnp.inf), end_source
 
     first, first_source = end(before, before >= 0)
     second, second_source = end(behind, behind < width)
@@ -64,26 +69,26 @@ def cheapest_sources(
     expected: Plane,
     medians: int = MEDIANS,
 ) -> Source:
-    """The source at the end of the cheapest path to each pixel, from pixel to pixel.
+    """The known pixel from which the cheapest path leads to each pixel.
 
-    A step costs its length, and more where `guide` (linear, 0 to 1) changes. A path pays where
-    it leaves the known pixels if its depth is nearer than `expected` there, by the logarithm
-    of their ratio. At last each missing pixel takes the median of its neighbours, `medians`
-    times.
+    A path goes from pixel to pixel, diagonals included. A step costs its length, and more where
+    `guide` (linear, 0 to 1) changes. Where a path leaves the known pixels, it costs more if its
+    depth is nearer than `expected` there, by the logarithm of their ratio. Finally each missing
+    pixel takes the source of the median of its neighbourhood, `medians` times.
     """
     height, width = depth.shape
     unit = float(max(height, width))
     farthest = jnp.max(jnp.where(jnp.isfinite(depth), depth, 0))
-    # A sky is as if twice as far as the farthest: beyond all, and within reach.
-    sky = jnp.where(farthest > 0, 2 * farthest, 1)
+    # The background counts as twice the farthest depth: beyond it, but with a finite logarithm.
+    background = jnp.where(farthest > 0, 2 * farthest, 1)
     planes = [
         jnp.sqrt(jnp.clip(jnp.nan_to_num(guide), 0, 1)),
-        jnp.log(jnp.minimum(depth, sky)),
-        jnp.log(jnp.minimum(expected, sky)),
+        jnp.log(jnp.minimum(depth, background)),
+        jnp.log(jnp.minimum(expected, background)),
     ]
-    # A quarter turn for each of the four directions from which a step can come.
-    turned = [[jnp.rot90(plane, turn) for plane in planes] for turn in range(4)]
-    steps = [_steps_down(shown, log, limit, unit) for shown, log, limit in turned]
+    # Rotated by a quarter turn for each of the four directions from which a step can come.
+    rotated = [[jnp.rot90(plane, turns) for plane in planes] for turns in range(4)]
+    steps = [_steps_down(image, log, limit, unit) for image, log, limit in rotated]
     is_known = ~jnp.isnan(depth)
     source = jnp.arange(height * width).reshape(height, width)
     paths = jnp.where(is_known, 0, jnp.inf).astype(depth.dtype), source
@@ -101,28 +106,32 @@ def cheapest_sources(
 
 
 def _above(plane: Float[Array, "height width ..."]) -> list[Float[Array, "height width ..."]]:
-    """For each pixel the three above it, the frame's own repeated."""
+    """The three pixels above each: left, middle, right; at the border the nearest inside."""
     height, width = plane.shape[:2]
     padded = jnp.pad(plane, [(1, 0), (1, 1)] + [(0, 0)] * (plane.ndim - 2), mode="edge")
     return [padded[:height, start : start + width] for start in range(3)]
 
 
 def _steps_down(
-    guide: Float[Array, "height width channel"], log_depth: Plane, log_limit: Plane, unit: float
+    guide: Float[Array, "height width channel"],
+    log_depth: Plane,
+    log_expected: Plane,
+    unit: float,
 ) -> Float[Array, "height 3 width"]:
-    """What the steps to each pixel cost, from the three above it."""
+    """The costs of the steps to each pixel from the three above it; `unit` is in pixels."""
     steps = []
-    for length, other, carried in zip(
+    for length, guide_above, log_above in zip(
         (2**0.5, 1.0, 2**0.5), _above(guide), _above(log_depth), strict=True
     ):
-        edge = jnp.mean(jnp.abs(guide - other), axis=2)
-        too_near = jnp.where(jnp.isnan(carried), 0, jnp.maximum(log_limit - carried, 0))
+        edge = jnp.mean(jnp.abs(guide - guide_above), axis=2)
+        # NaN above: the step does not leave the known pixels.
+        too_near = jnp.where(jnp.isnan(log_above), 0, jnp.maximum(log_expected - log_above, 0))
         steps.append(length + unit * (EDGE * edge + NEARER * too_near))
     return jnp.stack(steps, axis=1)
 
 
 def _swept_down(paths: Paths, steps: Float[Array, "height 3 width"]) -> Paths:
-    """Each row's paths after those that come from the row above."""
+    """The paths after each row in turn has taken the cheaper ones from the row above."""
 
     def row(above, here):
         (cost, source), step = here
@@ -130,17 +139,20 @@ def _swept_down(paths: Paths, steps: Float[Array, "height 3 width"]) -> Paths:
             offered, offered_source = (
                 jnp.pad(a, 1, mode="edge")[i : i - 2 or None] for a in above
             )
-            is_better = offered + step[i] < cost
-            cost = jnp.where(is_better, offered + step[i], cost)
-            source = jnp.where(is_better, offered_source, source)
+            is_cheaper = offered + step[i] < cost
+            cost = jnp.where(is_cheaper, offered + step[i], cost)
+            source = jnp.where(is_cheaper, offered_source, source)
         return (cost, source), (cost, source)
 
-    nothing = jnp.full_like(paths[0][0], jnp.inf), paths[1][0]
-    return jax.lax.scan(row, nothing, (paths, steps))[1]
+    no_paths = jnp.full_like(paths[0][0], jnp.inf), paths[1][0]
+    return jax.lax.scan(row, no_paths, (paths, steps))[1]
 
 
 def _median_sources(depth: Plane, source: Source) -> Source:
-    """The source of the median of the 3 x 3 pixels about each, the frame's own repeated."""
+    """The source of the median depth in the 3 x 3 pixels around each.
+
+    At the border the nearest pixel inside is repeated.
+    """
     height, width = source.shape
     padded = jnp.pad(source, 1, mode="edge")
     window = jnp.stack(

@@ -1,6 +1,6 @@
-"""Square roots, norms and quotients with finite gradients; the inverse of a small matrix.
+"""Elementwise functions with finite derivatives everywhere, and small dense algebra.
 
-The floor under everything else: arrays only, no types of this package.
+Of arrays alone: nothing here knows the package's types or checks arguments.
 """
 
 import functools
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 
 def common_dtype(*dtypes: DTypeLike) -> jnp.dtype:
-    """The widest of `dtypes`, asked for by name, so allowed where promotion is strict."""
+    """The widest of `dtypes`, by JAX's standard rules, even where promotion is strict."""
     with jax.numpy_dtype_promotion("standard"):
         return jnp.result_type(*dtypes)
 
@@ -27,8 +27,8 @@ def working_dtype(*dtypes: DTypeLike) -> jnp.dtype:
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Square root whose value and derivative are 0 where `x` is 0 or negative.
 
-    Not by a double `where`: XLA may compute its predicate twice, rounded differently, and then
-    selects what stood in for the root.
+    It does not use a double `where`: XLA may compute the predicate twice, rounded differently,
+    and then select the stand-in for the root.
     """
     return jnp.sqrt(jnp.maximum(x, 0))
 
@@ -37,7 +37,7 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def _safe_sqrt_jvp(primals, tangents):
     (x,), (x_dot,) = primals, tangents
     root = safe_sqrt(x)
-    floor = math.sqrt(jnp.finfo(x.dtype).tiny)  # its square, in a second derivative, is not 0
+    floor = math.sqrt(jnp.finfo(x.dtype).tiny)  # A second derivative divides by its square.
     return root, root / (2 * jnp.maximum(x, floor)) * x_dot
 
 
@@ -48,7 +48,7 @@ def safe_divide(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, 
 
 
 def sum_planes(planes: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
-    """The sum over a short axis before the last, plane by plane.
+    """The sum over a short axis other than the last, plane by plane.
 
     XLA's own reduction over such an axis takes ten times as long on a CPU.
     """
@@ -64,8 +64,8 @@ def normalize(vector: Float[Array, "... n"]) -> Float[Array, "... n"]:
 def inverse(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The inverse, by cofactors.
 
-    A decomposition is a chain of calls that nothing can be fused with: ten launches, and as
-    many again for its derivative.
+    `jnp.linalg.inv` calls a decomposition, which XLA can't fuse: ten launches on an
+    accelerator, and as many again for the derivative.
     """
     first, second, third = matrix
     columns = jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)

@@ -1,8 +1,17 @@
-"""Depth as cameras, files and networks give it: holes, units, disparity, distance.
+"""Depth from cameras, files and networks: units, disparity, distance, holes.
 
-One convention everywhere: 0, negative numbers and NaN are *missing*, inf is *nothing there*, a
-sky. What these functions give has NaN where the depth is missing and is positive elsewhere,
-height width, along the optical axis.
+| I have | call |
+|---|---|
+| depth in other units, or with a sky at some number | `clean(depth, scale=..., sky=...)` |
+| inverse depth of a network, up to scale and shift | `from_disparity(disparity, scale=...)` |
+| the disparity of a stereo pair | `from_stereo(disparity, focal_pixels=..., baseline=...)` |
+| the distance along each pixel's ray | `from_ray_distance(distance, camera)` |
+| missing pixels to fill | `fill(depth, image)` |
+
+One convention everywhere: 0, negative numbers and NaN are *missing*, inf is *background*. The
+results have NaN where the depth is missing, inf for background, and are positive elsewhere:
+height width, scene units along the optical axis. `fill(method="rows")` is a baseline, kept for
+comparison.
 """
 
 from typing import Any, Literal, final
@@ -24,7 +33,8 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 
 __all__ = ["Filled", "clean", "fill", "from_disparity", "from_ray_distance", "from_stereo"]
 
-# How renderers write that nothing is there: Blender's 1e10, and what a half float holds of it.
+# Depths that renderers write for background: Blender's 1e10, and the largest half float, to
+# which that is rounded. Without them a background is a surface, far away.
 SKY = (1e10, 65504.0)
 
 
@@ -34,24 +44,28 @@ def clean(
     scale: Num[ArrayLike, ""] = 1.0,
     sky: tuple[float | int, ...] | None = None,
 ) -> Float[Array, "height width"]:
-    """Depth in scene units with the holes of this module, from numbers as a file stores them.
+    """Depth in scene units and in this module's convention, from numbers as a file stores them.
+
+    The first step for depth of a file or a sensor.
+
+    **Example:**
 
     >>> import numpy as np
     >>> from jaxfx import depth
-    >>> depth.clean(np.array([[0, 1500]], np.uint16), scale=1 / 1000)  # millimetres to metres
+    >>> depth.clean(np.array([[0, 6]], np.uint16), scale=1 / 4)  # steps of a quarter metre
     Array([[nan, 1.5]], dtype=float32)
 
     **Arguments:**
 
     - `depth`: height width, floats or integers; 0, negative and NaN (and what a NumPy mask
-      hides) are missing, inf is nothing there.
+      hides) are missing, inf is background.
     - `scale`: scene units of one step of `depth`, positive.
-    - `sky`: static; further numbers, in steps of `depth`, that say that nothing is there, as
-      does all beyond the largest of them. Without it 1e10 and 65504 where `depth` is of
-      floats, which is how renderers write it; none where it is of integers.
+    - `sky`: static; further numbers, in steps of `depth`, that stand for background, as does
+      all beyond the largest of them. By default 1e10 and 65504, which renderers write, where
+      `depth` holds floats; none where it holds integers.
 
-    **Returns:** height width: NaN where missing, inf where nothing is there, positive
-    elsewhere; in the type of `depth`, at least float32; integers give JAX's default.
+    **Returns:** height width: NaN where missing, inf for background, positive elsewhere. In the
+    type of `depth`, at least float32; for integers JAX's default float type.
 
     **Raises:** `ValueError` for a wrong shape or type, or a scale that is not positive.
 
@@ -59,10 +73,10 @@ def clean(
     """
     scale = parameter("clean(scale=...)", scale)
     check("clean(scale=...)", scale, lambda v: (v > 0) & np.isfinite(v), "positive and finite")
-    values, is_nothing = _numbers_and_sky("clean(depth)", depth, sky)
-    is_known = (values > 0) & ~is_nothing
-    known = jnp.where(is_known, values, 1) * scale.astype(values.dtype)
-    return _with_holes(known, is_known, is_nothing)
+    values, is_background = _numbers_and_sky("clean(depth)", depth, sky)
+    is_known = (values > 0) & ~is_background
+    safe_depth = jnp.where(is_known, values, 1) * scale.astype(values.dtype)
+    return _with_holes(safe_depth, is_known, is_background)
 
 
 def from_disparity(
@@ -71,24 +85,31 @@ def from_disparity(
     scale: Num[ArrayLike, ""],
     shift: Num[ArrayLike, ""] = 0.0,
 ) -> Float[Array, "height width"]:
-    """Depth from inverse depth up to scale and shift, as networks for one image give it.
+    """Depth from inverse depth up to scale and shift, as networks for one image predict it.
 
-    `depth = 1 / (scale * disparity + shift)`. Where the denominator is 0 nothing is there
-    (inf); where it is negative or infinite the depth is missing, as it is where the disparity
-    is NaN. A stereo pair's disparity has other holes: `from_stereo`.
+    `depth = 1 / (scale * disparity + shift)`. The disparity of a stereo pair has another
+    convention for holes: see `from_stereo`.
 
     **Arguments:**
 
     - `disparity`: height width, larger where nearer.
-    - `scale`, `shift`: inverse scene units for one step, and for a disparity of 0. The two are
-      found by least squares from points of known depth, or one chooses the nearest and the
-      farthest depth.
+    - `scale`, `shift`: inverse scene units of one step, and of a disparity of 0. Find them by
+      least squares from points of known depth, or from the nearest and the farthest depth.
 
-    **Returns:** height width, scene units, with the holes of this module.
+    **Returns:** height width, scene units: inf where the denominator is 0; NaN, missing, where
+    it is negative or infinite and where the disparity is NaN.
 
     **Raises:** `ValueError` for a wrong shape or type.
 
     **Gradient:** exact in all three; zero where the depth is missing or inf.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import depth
+    >>> disparity = np.array([[2, 0, np.nan]], np.float32)
+    >>> print(depth.from_disparity(disparity, scale=0.25))
+    [[ 2. inf nan]]
 
     Source: Ranftl et al. 2020, disparity up to scale and shift.
     """
@@ -96,10 +117,10 @@ def from_disparity(
     scale = parameter("from_disparity(scale=...)", scale).astype(values.dtype)
     shift = parameter("from_disparity(shift=...)", shift).astype(values.dtype)
     is_number = jnp.isfinite(values)
-    inverse = jnp.where(is_number, values, 1) * scale + shift
-    is_known = is_number & (inverse > 0) & jnp.isfinite(inverse)
-    known = 1 / jnp.where(is_known, inverse, 1)
-    return _with_holes(known, is_known, is_number & (inverse == 0))
+    inverse_depth = jnp.where(is_number, values, 1) * scale + shift
+    is_known = is_number & (inverse_depth > 0) & jnp.isfinite(inverse_depth)
+    safe_depth = 1 / jnp.where(is_known, inverse_depth, 1)
+    return _with_holes(safe_depth, is_known, is_number & (inverse_depth == 0))
 
 
 def from_stereo(
@@ -111,24 +132,32 @@ def from_stereo(
 ) -> Float[Array, "height width"]:
     """Depth from the disparity of a rectified pair of cameras.
 
-    `depth = focal_pixels * baseline / (disparity + offset)`. A disparity of 0 says that no
-    match was found, as a negative one, NaN or inf does: the depth is missing there.
+    `depth = focal_pixels * baseline / (disparity + offset)`. The depth is missing where no
+    match was found: where the disparity is 0, negative, NaN or inf.
 
     **Arguments:**
 
     - `disparity`: height width, pixels between the two images of a point. (OpenCV's integers
-      are 16 steps a pixel, those of KITTI's files 256: divide first.)
+      count 16 steps per pixel, those of KITTI's files 256: divide first.)
     - `focal_pixels`: the focal length, in pixels.
     - `baseline`: the distance of the two cameras, scene units.
     - `offset`: the x of the second camera's principal point less that of the first, in pixels;
       the `doffs` of Middlebury's files.
 
-    **Returns:** height width, scene units, with the holes of this module.
+    **Returns:** height width, scene units, NaN where missing.
 
     **Raises:** `ValueError` for a wrong shape or type, or a focal length or baseline that is
     not positive.
 
     **Gradient:** exact in all four; zero where the depth is missing.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from jaxfx import depth
+    >>> disparity = np.array([[8, 0]], np.float32)
+    >>> print(depth.from_stereo(disparity, focal_pixels=64.0, baseline=0.25))
+    [[ 2. nan]]
 
     Source: Scharstein et al. 2014, the depth of a rectified pair with its offset.
     """
@@ -142,8 +171,8 @@ def from_stereo(
     shifted = jnp.where(is_match, values, 1) + offset
     is_known = is_match & (shifted > 0)
     product = focal.astype(values.dtype) * base.astype(values.dtype)
-    known = product / jnp.where(is_known, shifted, 1)
-    return _with_holes(known, is_known, jnp.zeros_like(is_known))
+    safe_depth = product / jnp.where(is_known, shifted, 1)
+    return _with_holes(safe_depth, is_known, jnp.zeros_like(is_known))
 
 
 def from_ray_distance(
@@ -151,35 +180,44 @@ def from_ray_distance(
 ) -> Float[Array, "height width"]:
     """Depth along the optical axis from the distance along each pixel's ray.
 
-    Path tracers and laser scanners give the latter. At the corner of a wide image it is half
-    as long again.
+    For path tracers and laser scanners. In the corner of a wide image the distance is half as
+    long again as the depth.
 
     **Arguments:**
 
     - `distance`: height width, scene units from the eye, with holes as in `clean`.
-    - `camera`: its rays go through the pixels' centres. Those of an orthographic camera start
-      on the plane of depth 0 and run along the axis: there the two are the same.
+    - `camera`: the camera, whose rays go through the pixels' centres. Those of an orthographic
+      camera start on the plane of depth 0 and run along the axis: there the two are the same.
 
-    **Returns:** height width, scene units, with the holes of this module.
+    **Returns:** height width, scene units: NaN where missing, inf for background.
 
     **Raises:** `ValueError` for a wrong shape or type.
 
     **Gradient:** exact in `distance` and the camera's intrinsics; zero where the depth is
     missing or inf, and in the pose.
+
+    **Example:** 90 degrees wide, so that a corner's ray is longer than the axis by sqrt(3):
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import PinholeCamera, depth
+    >>> camera = PinholeCamera.from_fov(jnp.pi / 2, height=8, width=8)
+    >>> distance = depth.from_ray_distance(jnp.ones((8, 8)), camera)
+    >>> print(distance.shape, round(float(distance[0, 0]), 2))
+    (8, 8) 0.63
     """
     check_camera("from_ray_distance(camera)", camera)
-    values, is_nothing = _numbers_and_sky("from_ray_distance(distance)", distance, None)
-    is_known = (values > 0) & ~is_nothing
-    known = jnp.where(is_known, values, 1)
+    values, is_background = _numbers_and_sky("from_ray_distance(distance)", distance, None)
+    is_known = (values > 0) & ~is_background
+    safe_depth = jnp.where(is_known, values, 1)
     if isinstance(camera, PinholeCamera):
-        known = known * _axis_per_ray(camera, values)
-    return _with_holes(known, is_known, is_nothing)
+        safe_depth = safe_depth * _axis_per_ray(camera, values)
+    return _with_holes(safe_depth, is_known, is_background)
 
 
 def _axis_per_ray(
     camera: PinholeCamera, like: Float[Array, "height width"]
 ) -> Float[Array, "height width"]:
-    """How far along the axis one goes in each pixel, for a unit along its ray."""
+    """Depth per unit of distance along each pixel's ray, a ratio; `like` has shape and type."""
     height, width = like.shape
     pixels = pixel_centers(height, width, like.dtype)
     columns = inverse(camera.intrinsics).astype(like.dtype).T[:, None, None, :]
@@ -189,7 +227,7 @@ def _axis_per_ray(
 
 @final
 class Filled(eqx.Module):
-    """A depth without holes, and what was changed to make it so.
+    """A depth without holes, and where it was filled.
 
     - `depth`: height width, scene units.
     - `filled`: height width, true where the depth was missing and is now another pixel's.
@@ -205,41 +243,51 @@ def fill(
     *,
     method: Literal["guided", "rows"] = "guided",
 ) -> Filled:
-    """Give each pixel whose depth is missing the depth of one that is known.
+    """Fill each pixel whose depth is missing with the depth of a known pixel.
 
-    Depths are copied, never averaged: between two surfaces there is none. What a depth camera
-    or a stereo pair misses lies mostly beside a near thing that hides the background from its
-    second eye; so the farther of a gap's two ends is the better guess.
-
-    - `"rows"` takes the farther of the nearest known depths on either side in the row; in a
-      row that knows nothing, in the column.
-    - `"guided"` takes the depth at the end of the cheapest path through the hole. A path costs
-      its length and, above all, the edges of `image` that it crosses, so that a depth fills
-      the surface that the image shows. It also pays where it leaves the known pixels with a
-      depth that is nearer than what `"rows"` would take there. At last the filled pixels take
-      the median of the 3 x 3 about them, twice, so that none stands alone. It knows nothing of
-      slopes: a wide hole in a floor becomes flat steps.
+    Depths are copied, never averaged: between two surfaces there is none. With `image`, a hole
+    is filled up to the edges that the image shows.
 
     **Arguments:**
 
     - `depth`: height width, with holes as in `clean`; inf is known and stays.
-    - `image`: height width channel, linear, black 0 to white 1; its edges guide. Without it
-      all paths cost their length alone.
-    - `method`: one of the two.
+    - `image`: height width channel, linear, black 0 to white 1, whose edges guide.
+    - `method`: `"guided"`, or the baseline `"rows"`; see below.
 
-    **Returns:** the record: the depth, and where it was changed. A depth that is missing
-    everywhere stays so under a transform, which can't look.
+    **Returns:** `Filled`, of the depth and the pixels that were filled. A depth that is missing
+    everywhere is an error, but under a transform, where values can't be checked, it is
+    returned as it is.
 
     **Raises:** `ValueError` for a wrong shape or type, or where no depth is known.
 
     **Gradient:** exact in `depth`: each filled pixel's goes to the one that it copies. Zero in
-    `image`; *missing* is how a change of it would change which pixel is copied.
+    `image`; missing is that a change of it changes which pixel is copied.
+
+    **Example:** a hole between a near and a far surface takes the depth of the far one:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import depth
+    >>> holed = jnp.full((8, 8), 5.0).at[:, :3].set(2.0).at[4, 3:5].set(jnp.nan)
+    >>> print(depth.fill(holed).depth[4])
+    [2. 2. 2. 5. 5. 5. 5. 5.]
+
+    Depth cameras and stereo pairs miss mostly what lies beside a near object, where it hides
+    the background from the second eye. So the farther of a gap's two ends is the better guess.
+
+    - `"rows"` takes the farther of the nearest known depths on either side in the row; in a
+      row without any, in the column.
+    - `"guided"` takes the depth at the end of the cheapest path through the hole. A path costs
+      its length and, above all, the edges of `image` that it crosses, so that a depth fills
+      the surface that the image shows. It costs more where it leaves the known pixels with a
+      depth that is nearer than that of `"rows"`. Finally the filled pixels take the median of
+      the 3 x 3 pixels around them, twice, so that none stands alone. It does not continue
+      slopes: a wide hole in a floor becomes flat steps.
 
     Source: our own. Distances over an image: Criminisi, Sharp & Blake 2008; the farther end as
     the guess for what is hidden: Hirschmüller 2008.
     """
-    values, is_nothing = _numbers_and_sky("fill(depth)", depth, None)
-    values = _with_holes(values, (values > 0) & ~is_nothing, is_nothing)
+    values, is_background = _numbers_and_sky("fill(depth)", depth, None)
+    values = _with_holes(values, (values > 0) & ~is_background, is_background)
     is_missing = jnp.isnan(values)
     if method not in ("guided", "rows"):
         raise ValueError(f'`fill(method=...)` must be "guided" or "rows", got {method!r}.')
@@ -253,17 +301,17 @@ def fill(
                 f"`fill(image)` must have the depth's height and width {values.shape}, "
                 f"got shape {guide.shape}."
             )
-    held, guide = jax.lax.stop_gradient((values, guide.astype(values.dtype)))
-    source = farther_ends(held)
+    constant, guide = jax.lax.stop_gradient((values, guide.astype(values.dtype)))
+    source = farther_ends(constant)
     if method == "guided":
-        source = cheapest_sources(held, guide, held.reshape(-1)[source])
+        source = cheapest_sources(constant, guide, constant.reshape(-1)[source])
     return Filled(values.reshape(-1)[source], is_missing)
 
 
 def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool]:
     """`values` as floats, height width, and whether they were integers.
 
-    What a NumPy mask hides is NaN.
+    NaN where a NumPy mask hides them.
     """
     is_masked = isinstance(values, np.ma.MaskedArray)
     array = values
@@ -287,22 +335,22 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
 def _numbers_and_sky(
     name: str, values: Any, sky: tuple[float | int, ...] | None
 ) -> tuple[Float[Array, "height width"], Bool[Array, "height width"]]:
-    """`values` as floats, and where they say that nothing is there."""
+    """`values` as floats, and where they are background, by `sky` or `SKY`."""
     numbers, is_integer = _numbers(name, values)
     if sky is None:
         sky = () if is_integer else SKY
-    is_nothing = jnp.isinf(numbers) & (numbers > 0)
+    is_background = jnp.isinf(numbers) & (numbers > 0)
     for mark in sky:
-        is_nothing |= numbers == jnp.asarray(mark, numbers.dtype)
+        is_background |= numbers == jnp.asarray(mark, numbers.dtype)
     if sky:
-        is_nothing |= numbers >= jnp.asarray(max(sky), numbers.dtype)
-    return numbers, is_nothing
+        is_background |= numbers >= jnp.asarray(max(sky), numbers.dtype)
+    return numbers, is_background
 
 
 def _with_holes(
-    known: Float[Array, "height width"],
+    depth: Float[Array, "height width"],
     is_known: Bool[Array, "height width"],
-    is_nothing: Bool[Array, "height width"],
+    is_background: Bool[Array, "height width"],
 ) -> Float[Array, "height width"]:
-    """`known` where it is, inf where nothing is, NaN elsewhere."""
-    return jnp.where(is_known, known, jnp.where(is_nothing, jnp.inf, jnp.nan))
+    """`depth` where `is_known`, inf for background, NaN elsewhere."""
+    return jnp.where(is_known, depth, jnp.where(is_background, jnp.inf, jnp.nan))

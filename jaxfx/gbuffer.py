@@ -1,4 +1,4 @@
-"""The deep frame buffer: what a pixel shows, and gets from others, before any light falls."""
+"""The deep frame buffer: the shading parameters of every pixel."""
 
 from typing import Any, final
 
@@ -14,24 +14,35 @@ __all__ = ["GBuffer"]
 
 @final
 class GBuffer(eqx.Module):
-    """The eight parameters of every pixel that no light changes.
+    """A cache of the eight shading parameters per pixel that do not depend on lights.
 
-    Position is not among them: it follows from `depth` and the camera.
+    Render a scene into it once, then shade it under any lights with `jaxfx.relight`. Positions
+    follow from `depth` and the camera.
 
     **Arguments:** images of one height and width.
 
     - `color`: height width 3, base colour of the surface, linear RGB.
     - `shader`: height width, integers: -1 nothing, 0 Lambert, 1 Phong, 2 Blinn.
     - `ambient`, `diffuse`, `specular`: height width 3, the linear RGB reflectances that
-      ambient, diffuse and specular light meet (the base colour is already in them).
+      ambient, diffuse and specular light are multiplied by (they include the base colour).
     - `normal`: height width 3, unit vectors in world space, zero where there is nothing.
     - `depth`: height width, scene units along the optical axis, inf where there is nothing.
     - `roughness`: height width, in [0, 1].
 
     **Raises:** `ValueError` where a shape does not fit `color`, `shader` is not of integers, or
-    a roughness lies outside [0, 1]; traced, one above 1 counts as 1.
+    a roughness lies outside [0, 1]. Traced values are not checked: one above 1 counts as 1.
 
     **Gradient:** exact with respect to every float image; `shader` has none.
+
+    **Example:** a white Lambert wall at depth 3:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import GBuffer
+    >>> white, shader = jnp.ones((8, 8, 3)), jnp.zeros((8, 8), int)
+    >>> normal, depth = white * jnp.array([0, 0, -1]), jnp.full((8, 8), 3.0)
+    >>> wall = GBuffer(white, shader, white, white, white, normal, depth, jnp.ones((8, 8)))
+    >>> wall.normal.shape, wall.depth.shape
+    ((8, 8, 3), (8, 8))
 
     Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting.
     """

@@ -1,4 +1,12 @@
-"""Lights. `direction` is the way the light travels; colours are linear RGB."""
+"""Lights. `direction` is that in which the light travels; colours are linear RGB.
+
+| I want | make |
+|---|---|
+| the same light from everywhere, without shadows | `AmbientLight(color)` |
+| a sun | `DirectionalLight(direction, color)` |
+| a lamp | `PointLight(position, color)` |
+| a lamp that shines into a cone | `SpotLight(position, direction, color, ...)` |
+"""
 
 from typing import Any, ClassVar, final
 
@@ -14,18 +22,21 @@ __all__ = ["AmbientLight", "DirectionalLight", "Light", "PointLight", "SpotLight
 
 
 def _vector(name: str, value: Any) -> Float[Array, "3"]:
+    """Three finite numbers; `ValueError` otherwise."""
     vector = parameter(name, value, (3,))
     check(name, vector, np.isfinite, "finite")
     return vector
 
 
 def _color(name: str, value: Any) -> Float[Array, "3"]:
+    """Three numbers, of any sign, inf included; `ValueError` for a NaN."""
     color = parameter(name, value, (3,))
     check(name, color, lambda v: ~np.isnan(v), "three numbers")
     return color
 
 
 def _direction(name: str, value: Any) -> Float[Array, "3"]:
+    """A vector that is not zero, of any length; `ValueError` otherwise."""
     direction = _vector(name, value)
     check(name, direction, lambda v: v.any(), "a vector other than zero")
     return direction
@@ -33,13 +44,19 @@ def _direction(name: str, value: Any) -> Float[Array, "3"]:
 
 @final
 class AmbientLight(eqx.Module):
-    """The same light from everywhere.
+    """The same light from everywhere: it casts no shadows and has no highlights.
 
     **Arguments:** `color`: 3, linear RGB irradiance.
 
     **Raises:** `ValueError` for a wrong shape or a NaN.
 
     **Gradient:** exact.
+
+    **Example:**
+
+    >>> from jaxfx import AmbientLight
+    >>> print(AmbientLight(color=[0.5, 0.5, 0.25]).color)
+    [0.5  0.5  0.25]
     """
 
     SHAPES: ClassVar = {"color": (3,)}
@@ -52,16 +69,23 @@ class AmbientLight(eqx.Module):
 
 @final
 class DirectionalLight(eqx.Module):
-    """A light from so far away that its rays are parallel: a sun.
+    """A light so far away that its rays are parallel: a sun.
 
     **Arguments:**
 
-    - `direction`: 3, the way the light travels, in world space; any length but zero.
+    - `direction`: 3, in which the light travels, in world space; any length but zero.
     - `color`: 3, linear RGB irradiance on a surface that faces it.
 
     **Raises:** `ValueError` for a wrong shape, a number that is not finite or a zero direction.
 
     **Gradient:** exact.
+
+    **Example:** a noon sun, where y points up:
+
+    >>> from jaxfx import DirectionalLight
+    >>> sun = DirectionalLight(direction=[0, -1, 0], color=[3, 3, 3])
+    >>> print(sun.direction)
+    [ 0. -1.  0.]
     """
 
     SHAPES: ClassVar = {"direction": (3,), "color": (3,)}
@@ -76,7 +100,7 @@ class DirectionalLight(eqx.Module):
 
 @final
 class PointLight(eqx.Module):
-    """A light from a point, the same in every direction.
+    """A light at a point, of the same intensity in every direction.
 
     **Arguments:**
 
@@ -86,6 +110,13 @@ class PointLight(eqx.Module):
     **Raises:** `ValueError` for a wrong shape or a number that is not finite.
 
     **Gradient:** exact.
+
+    **Example:**
+
+    >>> from jaxfx import PointLight
+    >>> lamp = PointLight(position=[0, 2, 0], color=[8, 8, 4])
+    >>> print(lamp.color)
+    [8. 8. 4.]
     """
 
     SHAPES: ClassVar = {"position": (3,), "color": (3,)}
@@ -100,21 +131,31 @@ class PointLight(eqx.Module):
 
 @final
 class SpotLight(eqx.Module):
-    """A light from a point into a cone: full inside `inner_angle`, none past `outer_angle`.
+    """A light at a point that shines into a cone.
+
+    Full inside `inner_angle`, fading smoothly to none at `outer_angle`.
 
     **Arguments:**
 
     - `position`: 3, in world space.
-    - `direction`: 3, the cone's axis, the way the light travels; any length but zero.
+    - `direction`: 3, the cone's axis, in which the light travels; any length but zero.
     - `color`: 3, linear RGB intensity on the axis.
     - `inner_angle`, `outer_angle`: radians from the axis, `0 <= inner_angle < outer_angle <=
       pi`.
 
     **Raises:** `ValueError` for a wrong shape, a number that is not finite, a zero direction or
-    angles out of order. Traced values can't be looked at: a cone whose angles are out of order
-    is dark.
+    angles out of order. Traced values are not checked: a cone whose angles are out of order is
+    dark.
 
     **Gradient:** exact.
+
+    **Example:**
+
+    >>> from jaxfx import SpotLight
+    >>> angles = {"inner_angle": 0.4, "outer_angle": 0.5}
+    >>> spot = SpotLight([0, 3, 0], [0, -1, 0], color=[9, 9, 9], **angles)
+    >>> print(spot.position, spot.direction)
+    [0. 3. 0.] [ 0. -1.  0.]
     """
 
     SHAPES: ClassVar = {

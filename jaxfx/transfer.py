@@ -15,8 +15,8 @@ __all__ = ["Transfer"]
 class Transfer(eqx.Module):
     """How light that falls on points of a scene reaches the pixels of a deep frame buffer.
 
-    The irradiance of pixel i from the points is the i-th entry of `receive @ (send @ b)`, where
-    `b` is what each point sends back: its irradiance times its `diffuse`. See `scene.transfer`.
+    Made by `scene.transfer`, which traces rays; used by `relight.indirect`. It depends on no
+    light, so it is computed once for all.
 
     **Arguments:**
 
@@ -29,6 +29,18 @@ class Transfer(eqx.Module):
     **Raises:** `ValueError` where the shapes do not fit one another.
 
     **Gradient:** exact with respect to every field.
+
+    **Example:** a single point, from which each of 8 x 8 pixels gets half:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import Transfer
+    >>> receive, send = jnp.full((8, 8, 1), 0.5), jnp.ones((1, 1))
+    >>> transfer = Transfer(receive, send, [[0, 0, 2]], [[0, 0, 1]], [[1, 1, 1]])
+    >>> (transfer.receive @ (transfer.send @ transfer.diffuse)).shape
+    (8, 8, 3)
+
+    The irradiance of the pixels from the points is `receive @ (send @ b)`, a low-rank matrix
+    product, where `b` is what each point sends back: its irradiance times its `diffuse`.
 
     Source: Hasan, Pellacini & Bala 2006, direct-to-indirect transfer.
     """

@@ -520,7 +520,7 @@ def test_no_function_is_forgotten():
     """Every public function of arrays, and every class, has valid arguments in `CALLS`."""
     host = {"scene", "exr", "io", "tradeoff"}
     records = {"Plan", "Accumulation", "Choice", "Synthesis", "Hit", "Receivers", "Candidates"}
-    records |= {"Lens", "Filled", "Projection", "Rays"}
+    records |= {"Lens", "Filled", "FilledCache", "LinearTaps", "Projection", "Rays"}
     for module in pkgutil.iter_modules(jaxfx.__path__):
         if module.name[0] == "_" or module.name in host:
             continue

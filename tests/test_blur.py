@@ -22,7 +22,7 @@ PAPER_LINEAR = {
 }
 
 
-def picture(height, width, channels=3, dtype=np.float64):
+def random_image(height, width, channels=3, dtype=np.float64):
     rng = np.random.default_rng([height, width, channels])
     return rng.random((height, width, channels)).astype(dtype)
 
@@ -81,7 +81,7 @@ def test_linear_reads_are_half_as_many_for_the_same_sum(taps):
     [((13, 11), 9), ((2, 9), 9), ((1, 23), 9), ((9, 8), 9), ((1, 1), 9), ((6, 7), 3)],
 )
 def test_the_sum_by_hand(size, taps, sampling):
-    image = picture(*size)
+    image = random_image(*size)
     weights = np.asarray(blur.binomial_weights(taps, row=taps + 3))
     out = blur.gaussian(image, taps=taps, sampling=sampling)
     np.testing.assert_allclose(out, by_hand(image, weights), rtol=1e-13)
@@ -89,7 +89,7 @@ def test_the_sum_by_hand(size, taps, sampling):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, jnp.bfloat16])
 def test_scipy_over_several_passes(dtype):
-    image = picture(31, 27).astype(dtype)
+    image = random_image(31, 27).astype(dtype)
     weights = np.asarray(blur.binomial_weights(7, row=6))
     expected = image.astype(np.float64)
     for _ in range(3):
@@ -103,14 +103,14 @@ def test_scipy_over_several_passes(dtype):
 
 @pytest.mark.parametrize("channels", [1, 2, 5])
 def test_any_number_of_channels(channels):
-    image = picture(12, 10, channels)
+    image = random_image(12, 10, channels)
     out = blur.gaussian(image, taps=5)
     weights = np.asarray(blur.binomial_weights(5, row=8))
     np.testing.assert_allclose(out, by_scipy(image, weights), rtol=1e-13)
 
 
 def test_both_samplings_agree_to_rounding():
-    image = picture(64, 48, dtype=np.float32)
+    image = random_image(64, 48, dtype=np.float32)
     discrete, linear = (
         blur.gaussian(image, passes=9, sampling=sampling) for sampling in ("discrete", "linear")
     )
@@ -153,7 +153,7 @@ def test_sigma_is_that_of_the_whole_blur(passes):
 
 
 def test_scipys_gaussian():
-    image = picture(24, 26, 1)
+    image = random_image(24, 26, 1)
     out = blur.gaussian(image, taps=13, sigma=1.5)
     expected = scipy.ndimage.gaussian_filter(image[..., 0], 1.5, mode="nearest", radius=6)
     np.testing.assert_allclose(out[..., 0], expected, rtol=1e-13)
@@ -166,7 +166,7 @@ def test_a_sigma_alone_sets_the_taps(sigma, passes):
     expected = float(sigma)
     assert spread_of(sigma, None, passes, reach=80) == pytest.approx(expected, rel=2e-3)
     # Inside of another trace, too, where it is closed over.
-    image = picture(9, 12)
+    image = random_image(9, 12)
     compiled = jax.jit(lambda image: blur.gaussian(image, sigma=sigma, passes=passes))(image)
     expected_image = blur.gaussian(image, sigma=sigma, passes=passes)
     np.testing.assert_allclose(compiled, expected_image, rtol=1e-6)
@@ -177,7 +177,7 @@ def test_a_sigma_alone_sets_the_taps(sigma, passes):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 3)])
 def test_a_sigma_of_0_alone_is_the_identity(size):
-    image = jnp.asarray(picture(*size))
+    image = jnp.asarray(random_image(*size))
     out, pull = jax.vjp(lambda image: blur.gaussian(image, sigma=0.0), image)
     np.testing.assert_array_equal(out, image)
     np.testing.assert_array_equal(pull(image)[0], image)
@@ -208,7 +208,7 @@ def test_a_sigma_that_the_taps_do_not_hold_falls_short_as_documented():
 @first("sampling", ["discrete", "linear"])
 def test_sigma_0_is_the_identity_with_a_gradient_of_0(sampling):
     """In float32; in float64, in `tests/stability`."""
-    image = jnp.asarray(picture(12, 14, dtype=np.float32))
+    image = jnp.asarray(random_image(12, 14, dtype=np.float32))
 
     @jax.jit
     def both(sigma):
@@ -223,7 +223,7 @@ def test_sigma_0_is_the_identity_with_a_gradient_of_0(sampling):
 
 @pytest.mark.full
 def test_gradients_in_sigma_and_the_image_are_differences():
-    image, bar = (jnp.asarray(picture(14, 12, c)[..., :2]) for c in (2, 3))
+    image, bar = (jnp.asarray(random_image(14, 12, c)[..., :2]) for c in (2, 3))
 
     @jax.jit
     def loss(image, sigma):
@@ -242,7 +242,7 @@ def test_gradients_in_sigma_and_the_image_are_differences():
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("pixel", [(10, 12), (0, 0), (3, 25), (20, 2)])
 def test_a_bad_pixel_spoils_what_its_taps_reach(pixel, value, sampling):
-    image = picture(21, 26)
+    image = random_image(21, 26)
     image[*pixel, 1] = value
     out = np.asarray(blur.gaussian(image, sampling=sampling))
     y, x = np.mgrid[:21, :26]
@@ -272,7 +272,7 @@ def test_bytes_round_where_floats_do_not():
 @pytest.mark.parametrize("taps", [2, 4, 6])
 @pytest.mark.parametrize("size", [(8, 10), (7, 5), (1, 1), (1, 4)])
 def test_half_the_size(size, taps):
-    image = picture(*size)
+    image = random_image(*size)
     weights = np.asarray(blur.binomial_weights(taps, row=taps - 1))
     rows, columns = (
         np.arange(2 * -(-n // 2)).reshape(-1, 2)[:, :1] + np.arange(taps) - taps // 2 + 1
@@ -285,13 +285,13 @@ def test_half_the_size(size, taps):
 
 
 def test_twice_halved_is_the_mean_of_16():
-    image = picture(12, 8)
+    image = random_image(12, 8)
     quarter = blur.downsample(blur.downsample(image))
     np.testing.assert_allclose(quarter, image.reshape(3, 4, 2, 4, 3).mean(axis=(1, 3)))
 
 
 def test_faults_are_named():
-    image = picture(4, 4)
+    image = random_image(4, 4)
     gaussian = inspect.unwrap(blur.gaussian)
     for options, message in [
         ({"taps": 4}, r"`gaussian\(taps=...\)` must be an odd positive integer, got 4"),

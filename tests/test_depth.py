@@ -130,7 +130,7 @@ def test_no_match_is_missing():
 
 
 def test_ray_distance():
-    """The length of the way from the eye to a point, by the camera's own unprojection."""
+    """The distance from the eye to a point, by the camera's own unprojection."""
     pose = np.eye(4)
     pose[:3, 3] = 1, -2, 5
     camera = PinholeCamera([[20, 0.3, 4], [0, 18, 3], [0, 0, 1]], pose)

@@ -17,7 +17,7 @@ PUBLIC_MODULES = {
     module.name for module in pkgutil.iter_modules(jaxfx.__path__) if module.name[0] != "_"
 }
 # Modules of types, whose names `jaxfx` itself exports.
-TYPES = {"camera", "gbuffer", "lens", "light"}
+TYPES = {"camera", "gbuffer", "lens", "light", "transfer"}
 
 
 def run(code):

@@ -50,22 +50,22 @@ class CacheSamples(NamedTuple):
     """What one cache stores for each point of the new view.
 
     - `is_visible`: whether the cache sees the point.
-    - `index`: flat index of the cache's pixel that was read.
+    - `pixel`: flat index of the cache's pixel that was read.
     - `shader`, `normal`: of that pixel.
     - `distance`: from the point to that pixel's surface, across it, as a ratio of the depth.
     - `detail`: cache pixels on a square of the surface whose side is the point's depth.
     """
 
     is_visible: Bool[Array, "height width"]
-    index: Int[Array, "height width"]
+    pixel: Int[Array, "height width"]
     shader: Int[Array, "height width"]
     normal: Vectors
     distance: Scalars
     detail: Scalars
 
     def read(self, field: Shaped[Array, "rows columns ..."]) -> Shaped[Array, "..."]:
-        """One of the cache's images at `index`."""
-        return _read(field, self.index)
+        """One of the cache's images at `pixel`."""
+        return _read(field, self.pixel)
 
 
 def check_caches(

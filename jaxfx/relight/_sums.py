@@ -1,8 +1,8 @@
-"""What many lights bring to a surface, as sums that a light can be taken out of again.
+"""Sums of many lights' terms per pixel, to which a light can be added or taken out again.
 
-Two things keep a long chain of changes true. The sums carry along what rounding takes from
-them; and what is put in and what is taken out pass through the same compiled loop, and so are
-the same to the last bit.
+Two things keep long chains of edits exact. The sums are compensated: what rounding loses is
+summed up beside them. And a light is added and taken out by one compiled loop, so both terms
+are equal to the last bit.
 """
 
 from typing import NamedTuple, get_args
@@ -12,46 +12,50 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxfx.light import AmbientLight, Light
-from jaxfx.relight.shading import Surface, received, seen, stacked
+from jaxfx.relight.shading import Surface, received, shadowed, stack_visibilities
 
 
 _Image = Float[Array, "height width 3"]
 
 
 class Sum(NamedTuple):
-    """A sum of images, and the sum of what rounding took from it."""
+    """A compensated sum of images: the sum, and the sum of what rounding lost."""
 
     total: _Image
     lost: _Image
 
 
 class Sums(NamedTuple):
-    """What the lights bring, but for ambient ones.
+    """The sums over all lights but ambient ones.
 
-    `spoiled` counts the lights that bring a pixel something that is not finite. They are left
-    out of the sums, or nothing would take them out again.
+    `diffuse` and `specular` are before the reflectances multiply them. `nonfinite` counts, per
+    pixel, the lights whose term is not finite. Those terms are left out of the sums: nothing
+    could take them out again.
     """
 
     diffuse: Sum
     specular: Sum
-    spoiled: Int[Array, "height width"]
+    nonfinite: Int[Array, "height width"]
 
 
-def nothing(surface: Surface) -> Sums:
-    """The sums of no lights."""
+def sums_of_none(surface: Surface) -> Sums:
+    """The sums without any light."""
     zero = jnp.zeros_like(surface.position)
     return Sums(Sum(zero, zero), Sum(zero, zero), jnp.zeros_like(surface.shader))
 
 
 @jax.jit
-def changed(surface, sums, lights, visibility, signs):
-    """The sums with each light's share times its sign: one loop for each kind of light."""
+def with_lights(surface, sums, lights, visibilities, signs):
+    """The sums with each light's term times its sign, 1 to add or -1 to take out.
+
+    One loop for each kind of light; ambient lights have no term.
+    """
     for kind in get_args(Light):
         which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
         if not which or kind is AmbientLight:
             continue
         group = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lights[i] for i in which))
-        shadows = stacked([visibility[i] for i in which], surface)
+        shadows = stack_visibilities([visibilities[i] for i in which], surface)
         step = lambda sums, term: (_with_term(surface, sums, *term), None)
         sums, _ = jax.lax.scan(step, sums, (group, shadows, signs[jnp.array(which)]))
     return sums
@@ -64,22 +68,23 @@ def _with_term(
     visibility: Float[Array, "height width"] | None,
     sign: Float[Array, ""],
 ) -> Sums:
-    shares = jax.checkpoint(received, prevent_cse=False)(surface, light)
-    shares = tuple(seen(surface, share, visibility) for share in shares)
+    """The sums with one light's term times `sign`."""
+    terms = jax.checkpoint(received, prevent_cse=False)(surface, light)
+    terms = tuple(shadowed(surface, term, visibility) for term in terms)
     # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once, with
     # a third less work; that of 0.10 drops the barrier and computes them again for each.
-    diffuse, specular = jax.lax.optimization_barrier(shares)
-    finite = jnp.isfinite(diffuse).all(axis=-1) & jnp.isfinite(specular).all(axis=-1)
-    signed = lambda share: jnp.where(finite[..., None], sign * share, 0)
+    diffuse, specular = jax.lax.optimization_barrier(terms)
+    is_finite = jnp.isfinite(diffuse).all(axis=-1) & jnp.isfinite(specular).all(axis=-1)
+    signed = lambda term: jnp.where(is_finite[..., None], sign * term, 0)
     return Sums(
         _add(sums.diffuse, signed(diffuse)),
         _add(sums.specular, signed(specular)),
-        sums.spoiled + jnp.where(finite, 0, sign).astype(jnp.int32),
+        sums.nonfinite + jnp.where(is_finite, 0, sign).astype(jnp.int32),
     )
 
 
 def _add(to: Sum, term: _Image) -> Sum:
-    """The sum and what it lost, exactly."""
+    """The sum with a term; what rounding lost is computed exactly (Knuth 1969)."""
     total = to.total + term
     added = total - to.total
     lost = (to.total - (total - added)) + (term - added)
@@ -87,12 +92,15 @@ def _add(to: Sum, term: _Image) -> Sum:
 
 
 @jax.jit
-def image(surface, sums, ambient):
-    """The picture: the sums times what the surface reflects, ambient light added."""
+def image_of(surface, sums, ambient):
+    """The image: the sums times the reflectances, and the ambient lights.
+
+    `ambient` holds pairs of a light and its visibility.
+    """
     diffuse, specular = (part.total + part.lost for part in (sums.diffuse, sums.specular))
     image = surface.diffuse * diffuse + surface.specular * specular
-    for light, visible in ambient:
-        share = light.color[None, None] * surface.ambient
-        image = image + (share if visible is None else visible[..., None] * share)
-    image = jnp.where((sums.spoiled > 0)[..., None], jnp.nan, image)
+    for light, visibility in ambient:
+        term = light.color[None, None] * surface.ambient
+        image = image + (term if visibility is None else visibility[..., None] * term)
+    image = jnp.where((sums.nonfinite > 0)[..., None], jnp.nan, image)
     return jnp.where((surface.shader < 0)[..., None], 0, image)

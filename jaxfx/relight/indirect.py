@@ -1,4 +1,4 @@
-"""Light that comes by way of another surface, for the cost of a matrix product."""
+"""Light that one surface sends on to another, once, for the cost of a matrix product."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,21 +23,16 @@ def indirect(
     *,
     visibilities: Sequence[Any] | None = None,
 ) -> Float[Array, "height width 3"]:
-    """The picture of what diffuse surfaces send on to one another, once: add it to `render`'s.
+    """The image of one diffuse bounce: add it to `render`'s.
 
-    With E the irradiance of the transfer's points under the lights,
-    `gbuffer.diffuse * receive @ (send @ (diffuse * E))`. It is linear in the lights: that of
-    an edited light alone is the change of the picture.
-
-    It does badly where a surface is nearly touched by another, for a point stands for a disc;
-    and knows no highlight, neither of the light that is sent nor of the surface that sends.
+    It is linear in the lights, so after an edit only the edited light has to be computed again.
 
     **Arguments:**
 
     - `gbuffer`: the cache, height width.
     - `transfer`: from `scene.transfer`, of this cache.
     - `lights`: a sequence of lights of any kinds. Ambient ones stand for indirect light
-      themselves, and bring nothing here.
+      themselves, and add nothing here.
     - `visibilities`: one per light: for each point of `transfer` a number in [0, 1] or a
       boolean, the share of the light that arrives, or None for all of it. For a point light,
       `scene.visible(mesh, transfer.position, light.position)` computes it. None alone stands
@@ -51,6 +46,25 @@ def indirect(
 
     **Gradient:** exact with respect to `gbuffer.diffuse`, every field of `transfer`, the lights
     and `visibilities`, as `shade`'s; zero with respect to the cache's other images.
+
+    **Example:** one point one unit before a wall sends light back to it:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import DirectionalLight, GBuffer, Transfer, relight
+    >>> white, shader = jnp.ones((8, 8, 3)), jnp.zeros((8, 8), int)
+    >>> normal, depth = white * jnp.array([0, 0, -1]), jnp.full((8, 8), 3.0)
+    >>> wall = GBuffer(white, shader, white, white / 2, white, normal, depth, depth / 6)
+    >>> receive, send = jnp.full((8, 8, 1), 0.5), jnp.ones((1, 1))
+    >>> transfer = Transfer(receive, send, [[0, 0, 2]], [[0, 0, 1]], [[1, 1, 1]])
+    >>> lamp = DirectionalLight([0, 0, -1], [1, 1, 1])
+    >>> print(relight.indirect(wall, transfer, [lamp])[4, 4])
+    [0.25 0.25 0.25]
+
+    With E the irradiance of the transfer's points under the lights, the image is
+    `gbuffer.diffuse * receive @ (send @ (diffuse * E))`.
+
+    It is wrong where two surfaces nearly touch, for a point stands for a disc. It has no
+    highlights: points send and pixels receive diffuse light alone.
 
     Source: Hasan, Pellacini & Bala 2006, equation 3.
     """
@@ -76,31 +90,33 @@ def indirect(
 def _indirect(gbuffer, transfer, lights, visibilities):
     dtype = working_dtype(gbuffer.color.dtype)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
-    surface = _points(transfer)
-    arriving = jnp.zeros_like(transfer.diffuse)
-    for light, part in zip(lights, visibilities, strict=True):
+    surface = _as_surface(transfer)
+    irradiance = jnp.zeros_like(transfer.diffuse)
+    for light, visibility in zip(lights, visibilities, strict=True):
         if not isinstance(light, AmbientLight):
-            brought = received(surface, light)[0][0]
-            arriving += brought if part is None else part.astype(dtype)[:, None] * brought
-    sent = transfer.send @ (transfer.diffuse * arriving)
+            term = received(surface, light)[0][0]
+            irradiance += (
+                term if visibility is None else visibility.astype(dtype)[:, None] * term
+            )
+    sent = transfer.send @ (transfer.diffuse * irradiance)
     image = gbuffer.diffuse.astype(dtype) * (transfer.receive @ sent)
     image = jnp.where((gbuffer.shader < 0)[..., None], 0, image)
     return image.astype(gbuffer.color.dtype)
 
 
-def _points(transfer: Transfer) -> Surface:
-    """The points as a surface of one row, Lambert."""
+def _as_surface(transfer: Transfer) -> Surface:
+    """The transfer's points as a Lambert surface of one row of pixels."""
     position, normal, diffuse = (
         field[None] for field in (transfer.position, transfer.normal, transfer.diffuse)
     )
-    zero, plain = jnp.zeros_like(position), position[..., 0]
+    zero, one_row = jnp.zeros_like(position), position[..., 0]
     return Surface(
-        shader=jnp.zeros(plain.shape, jnp.int32),
+        shader=jnp.zeros(one_row.shape, jnp.int32),
         position=position,
         normal=normal,
         to_camera=zero,
         ambient=zero,
         diffuse=diffuse,
         specular=zero,
-        exponent=jnp.zeros_like(plain),
+        exponent=jnp.zeros_like(one_row),
     )

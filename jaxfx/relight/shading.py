@@ -1,11 +1,11 @@
-"""What a deep frame buffer looks like under given lights.
+"""Shading a deep frame buffer under given lights.
 
-A light is known by two things at a pixel: the direction towards it and the irradiance that it
-brings. A shader is known by one: the pair of unit vectors whose cosine its highlight is a power
-of. Everything is elementwise over pixels.
+At a pixel, a light is described by the direction towards it and its irradiance; a shader by the
+two unit vectors whose cosine, raised to a power, is its highlight. Everything is elementwise
+over pixels. `jaxfx.budget` uses `Surface`, `to_surface`, `reflected` and `check_shader`.
 
-Cosines near 1 are kept as `1 - cosine`, half the squared distance between unit vectors: sharp
-highlights and narrow cones are not lost to cancellation, and no cosine exceeds 1.
+Cosines near 1 are computed as `1 - cosine`, half the squared distance between unit vectors, so
+that sharp highlights and narrow cones lose no digits and no cosine exceeds 1.
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,18 @@ from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotL
 
 _Vectors = Float[Array, "height width 3"]
 _Scalars = Float[Array, "height width"]
+# Numbers of shaders in a G-buffer; 0, Lambert, has no highlight.
 _NOTHING, _PHONG, _BLINN = -1, 1, 2
-# A pixel's vector that is shorter (scene units, for the way to a light) is divided by this in
-# place of its length, and so fades to zero: even float32's second derivatives stay finite.
+# Length of a vector: scene units, of those to lights. A shorter vector is divided by this in
+# place of its length, and so fades to zero. Smaller values let float32's second derivatives
+# overflow next to a light.
 _SHORTEST = 1e-5
-# So many lights are shaded at once on an accelerator, each in the memory of some images.
+# Lights shaded together on an accelerator. More means fewer launches, and the memory of some
+# images for each.
 _TOGETHER = 8
-_SMOOTHEST = 1e-4  # A smaller roughness is this: a highlight far narrower than a pixel.
+# Roughness. A smaller one counts as this, whose highlight is far narrower than a pixel; without
+# it the exponent of a roughness of 0 is infinite.
+_LEAST_ROUGHNESS = 1e-4
 
 
 def shade(
@@ -46,25 +51,16 @@ def shade(
     | Bool[ArrayLike, "height width"]
     | None = None,
 ) -> Float[Array, "height width 3"]:
-    """The picture under one light.
+    """The image under one light.
 
-    With N, L and V the unit vectors along the normal and towards light and camera, R the mirror
-    image of L about N, H halfway between L and V, and n = 2 / roughness**2 - 2, a pixel is
-
-    - `color * ambient` under ambient light;
-    - `E * diffuse * max(N.L, 0)` under any other, to which, where N.L > 0, Phong adds
-      `E * specular * max(R.V, 0)**n` and Blinn `E * specular * max(N.H, 0)**n`.
-
-    E is the light's colour, over the squared distance for point and spot lights. A spot light's
-    is also multiplied by `s * s * (3 - 2 * s)`, where s rises linearly in the cosine of the
-    angle off its axis, from 0 at `outer_angle` to 1 at `inner_angle`.
+    For a single light; `render` sums over several.
 
     **Arguments:**
 
     - `gbuffer`, `camera`: the cache, height width, and the camera that it was made with.
     - `light`: any of the four.
-    - `visibility`: height width, in [0, 1] or booleans; multiplies the result. All 1 if left
-      out.
+    - `visibility`: height width, in [0, 1] or booleans: the share of the light that arrives,
+      from a filter of `jaxfx.shadow` for instance. Left out, all of it arrives.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`. Exactly 0 where the
     shader is -1, the depth inf or missing (0, negative, NaN). A NaN elsewhere stays in its
@@ -72,18 +68,41 @@ def shade(
     scene units fades out.
 
     **Raises:** `ValueError` for a wrong shape, an unknown light or shader, or a visibility
-    outside [0, 1]. Traced values can't be looked at: any shader but 0, 1 and 2 is black, and a
-    visibility multiplies as it is.
+    outside [0, 1]. Traced values are not checked: any shader but 0, 1 and 2 is black, and any
+    visibility multiplies.
 
     **Gradient:** exact, forward and reverse, with respect to the light, the camera,
     `visibility` and every float image of the cache but `color`, which is not read. At N.L = 0,
     R.V = 0 and N.H = 0 it is the one from the dark side, 0. A highlight that N.L = 0 cuts off
     jumps there: that derivative is missing.
 
+    **Example:** a Lambert wall that faces camera and light:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import DirectionalLight, GBuffer, OrthographicCamera, relight
+    >>> white, shader = jnp.ones((8, 8, 3)), jnp.zeros((8, 8), int)
+    >>> normal, depth = white * jnp.array([0, 0, -1]), jnp.full((8, 8), 3.0)
+    >>> wall = GBuffer(white, shader, white, white / 2, white, normal, depth, depth / 6)
+    >>> camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> image = relight.shade(wall, camera, DirectionalLight([0, 0, 1], [1, 1, 1]))
+    >>> print(image.shape, image[4, 4])
+    (8, 8, 3) [0.5 0.5 0.5]
+
+    With N, L and V the unit vectors along the normal and towards light and camera, R the mirror
+    image of L about N, H halfway between L and V, and n = 2 / roughness**2 - 2, a pixel is
+
+    - `color * ambient` under ambient light, `color` being the light's;
+    - `E * diffuse * max(N.L, 0)` under any other, to which, where N.L > 0, Phong adds
+      `E * specular * max(R.V, 0)**n` and Blinn `E * specular * max(N.H, 0)**n`.
+
+    E is the light's colour, over the squared distance for point and spot lights. A spot light's
+    is also multiplied by `s * s * (3 - 2 * s)`, where s rises linearly in the cosine of the
+    angle off its axis, from 0 at `outer_angle` to 1 at `inner_angle`.
+
     Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting;
     the models are those of Phong 1975 and Blinn 1977.
     """
-    gbuffer = checked("shade", gbuffer, camera)
+    gbuffer = check_cache("shade", gbuffer, camera)
     check_light("shade(light)", light)
     if visibility is not None:
         visibility = share("shade(visibility)", visibility, gbuffer.depth.shape)
@@ -99,11 +118,13 @@ def render(
 ) -> Float[Array, "height width 3"]:
     """The image under several lights and their shadows: the sum of `shade` over them.
 
+    For one image. To edit lights one after another, keep a state (`start`).
+
     **Arguments:**
 
     - `gbuffer`, `camera`: as in `shade`.
     - `lights`: a sequence of lights of any kinds. None give a black image.
-    - `visibilities`: for each light, height width in [0, 1], or None where it has no shadows.
+    - `visibilities`: one per light: height width in [0, 1], or None where it has no shadows.
       None alone stands for no shadows at all.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`.
@@ -113,17 +134,34 @@ def render(
     **Gradient:** as `shade`'s. A reverse pass shades each light again, so that its memory does
     not grow with their number.
 
+    **Example:** the second light is in shadow:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import DirectionalLight, GBuffer, OrthographicCamera, relight
+    >>> white, shader = jnp.ones((8, 8, 3)), jnp.zeros((8, 8), int)
+    >>> normal, depth = white * jnp.array([0, 0, -1]), jnp.full((8, 8), 3.0)
+    >>> wall = GBuffer(white, shader, white, white / 2, white, normal, depth, depth / 6)
+    >>> camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> lights = [DirectionalLight([0, 0, 1], [n, n, n]) for n in (1, 2)]
+    >>> image = relight.render(wall, camera, lights, visibilities=[None, jnp.zeros((8, 8))])
+    >>> print(image[4, 4])
+    [0.5 0.5 0.5]
+
     Source: as `shade`'s.
     """
     lights = check_lights("render(lights)", lights)
-    gbuffer = checked("render", gbuffer, camera)
+    gbuffer = check_cache("render", gbuffer, camera)
     name, shape = "render(visibilities=...)", gbuffer.depth.shape
     visible = tuple(shares(name, visibilities, len(lights), shape))
     return _render(gbuffer, camera, lights, visible)
 
 
 class Surface(NamedTuple):
-    """What every light meets: the part of shading that no light changes."""
+    """The visible surface, per pixel: the part of shading that depends on no light.
+
+    `normal` and `to_camera` are unit vectors in world space; the three reflectances are linear
+    RGB; `exponent` is that of the highlight.
+    """
 
     shader: Int[Array, "height width"]
     position: _Vectors
@@ -136,42 +174,42 @@ class Surface(NamedTuple):
 
 
 def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> Surface:
-    """The surface in every pixel; where there is none, shader -1 and harmless numbers."""
+    """The surface of a cache; where there is none, shader -1 and finite stand-ins."""
     dtype = working_dtype(gbuffer.color.dtype)
     shader = gbuffer.shader.astype(jnp.int32)
-    is_somewhere = (gbuffer.depth > 0) & (gbuffer.depth != jnp.inf)
-    shown = (shader > _NOTHING) & (shader <= _BLINN) & is_somewhere
-    shiny = shown & (shader >= _PHONG)
+    has_depth = (gbuffer.depth > 0) & (gbuffer.depth != jnp.inf)
+    is_surface = (shader > _NOTHING) & (shader <= _BLINN) & has_depth
+    is_shiny = is_surface & (shader >= _PHONG)
 
-    def known(field: Array, otherwise: int, where: Array = shown) -> Array:
-        where = where if field.ndim == 2 else where[..., None]
-        return jnp.where(where, field.astype(dtype), otherwise)
+    def masked(field: Array, stand_in: int, mask: Array = is_surface) -> Array:
+        mask = mask if field.ndim == 2 else mask[..., None]
+        return jnp.where(mask, field.astype(dtype), stand_in)
 
-    depth = known(gbuffer.depth, 1)
+    depth = masked(gbuffer.depth, 1)
     pixels = pixel_centers(depth.shape[0], depth.shape[1], dtype)
     position = camera.unproject(pixels, depth)
-    # Depth 0 is the eye, or the point of its plane that an orthographic ray comes from.
+    # At depth 0 lies the eye, or the start of an orthographic ray.
     to_camera = camera.unproject(pixels, jnp.zeros_like(depth)) - position
     return Surface(
-        shader=jnp.where(shown, shader, _NOTHING),
+        shader=jnp.where(is_surface, shader, _NOTHING),
         position=position,
-        normal=_unit(known(gbuffer.normal, 0)),
+        normal=_unit(masked(gbuffer.normal, 0)),
         to_camera=_unit(to_camera),
-        ambient=known(gbuffer.ambient, 0),
-        diffuse=known(gbuffer.diffuse, 0),
-        specular=known(gbuffer.specular, 0, shiny),
-        exponent=exponent(known(gbuffer.roughness, 1, shiny)),
+        ambient=masked(gbuffer.ambient, 0),
+        diffuse=masked(gbuffer.diffuse, 0),
+        specular=masked(gbuffer.specular, 0, is_shiny),
+        exponent=exponent(masked(gbuffer.roughness, 1, is_shiny)),
     )
 
 
 def exponent(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The power that a highlight's cosine is raised to."""
+    """The power to which a highlight's cosine is raised, from a roughness in [0, 1]."""
     roughness = jnp.where(roughness > 1, 1, roughness)
-    return 2 / jnp.maximum(roughness**2, _SMOOTHEST**2) - 2
+    return 2 / jnp.maximum(roughness**2, _LEAST_ROUGHNESS**2) - 2
 
 
 def reflected(surface: Surface, light: Light) -> _Vectors:
-    """What `surface` sends to the camera under one light."""
+    """The light that `surface` reflects to the camera under one light, without shadows."""
     if isinstance(light, AmbientLight):
         color = light.color.astype(surface.position.dtype)
         image = color[None, None] * surface.ambient
@@ -184,18 +222,21 @@ def reflected(surface: Surface, light: Light) -> _Vectors:
 def received(
     surface: Surface, light: DirectionalLight | PointLight | SpotLight
 ) -> tuple[_Vectors, _Vectors]:
-    """What one light brings for the diffuse and for the specular reflectance to multiply."""
+    """One light's diffuse and specular light, before the reflectances multiply it.
+
+    For the diffuse one that is the irradiance; for the specular one irradiance times highlight.
+    """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
-    to_light, irradiance = _arriving(light, surface.position)
+    to_light, irradiance = _direction_and_irradiance(light, surface.position)
     cosine = _dot(surface.normal, to_light)
     diffuse = irradiance * jnp.where(cosine <= 0, 0, cosine)[..., None]
     return diffuse, irradiance * _highlight(surface, to_light, cosine)[..., None]
 
 
-def _arriving(
+def _direction_and_irradiance(
     light: DirectionalLight | PointLight | SpotLight, position: _Vectors
 ) -> tuple[_Vectors, Float[Array, "#height #width 3"]]:
-    """The direction towards `light` and its irradiance on a surface that faces it."""
+    """The unit vectors to `light`, and its irradiance on a surface that faces it."""
     color = light.color[None, None]
     if isinstance(light, DirectionalLight):
         return jnp.broadcast_to(-normalize(light.direction), position.shape), color
@@ -207,6 +248,7 @@ def _arriving(
 
 
 def _cone(light: SpotLight, to_light: _Vectors) -> _Scalars:
+    """The share of a spot light's intensity in the directions opposite to `to_light`."""
     inner = 2 * jnp.sin(light.inner_angle / 2) ** 2
     outer = 2 * jnp.sin(light.outer_angle / 2) ** 2
     angle = _one_minus_cosine(-normalize(light.direction)[None, None], to_light)
@@ -217,24 +259,25 @@ def _cone(light: SpotLight, to_light: _Vectors) -> _Scalars:
 
 def _highlight(surface: Surface, to_light: _Vectors, cosine: _Scalars) -> _Scalars:
     """Phong's max(R.V, 0)**n or else Blinn's max(N.H, 0)**n; 0 where N.L <= 0."""
-    phong = (surface.shader == _PHONG)[..., None]
+    is_phong = (surface.shader == _PHONG)[..., None]
     mirrored = 2 * cosine[..., None] * surface.normal - to_light
     halfway = _unit(to_light + surface.to_camera)
-    one = jnp.where(phong, mirrored, surface.normal)
-    other = jnp.where(phong, surface.to_camera, halfway)
-    miss = _one_minus_cosine(one, other)
-    # The last two say the same but for rounding and for vectors of length 0.
-    dark = (cosine <= 0) | (_dot(one, other) <= 0) | (miss >= 1)
-    power = jnp.exp(surface.exponent * jnp.log1p(-jnp.where(dark, 0, miss)))
-    return jnp.where(dark, 0, power)
+    a = jnp.where(is_phong, mirrored, surface.normal)
+    b = jnp.where(is_phong, surface.to_camera, halfway)
+    one_minus_cosine = _one_minus_cosine(a, b)
+    # The last two differ by rounding, and for vectors of length 0.
+    is_dark = (cosine <= 0) | (_dot(a, b) <= 0) | (one_minus_cosine >= 1)
+    log_cosine = jnp.log1p(-jnp.where(is_dark, 0, one_minus_cosine))
+    return jnp.where(is_dark, 0, jnp.exp(surface.exponent * log_cosine))
 
 
 def _dot(a: _Vectors, b: _Vectors) -> _Scalars:
-    # Written out, for a reduction over three numbers would end every fusion here.
+    # Written out, because XLA does not fuse across a reduction over three numbers.
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def _one_minus_cosine(a: Float[Array, "#height #width 3"], b: _Vectors) -> _Scalars:
+    """1 - a . b of unit vectors, without cancellation where they are close."""
     return _dot(a - b, a - b) / 2
 
 
@@ -246,30 +289,35 @@ def _unit(vector: _Vectors) -> _Vectors:
     return vector / jnp.sqrt(_squared_length(vector))
 
 
-def checked(function: str, gbuffer: Any, camera: Any) -> GBuffer:
-    """The cache of a camera, built again to check its shapes: both may have been edited."""
+def check_cache(function: str, gbuffer: Any, camera: Any) -> GBuffer:
+    """The cache of a camera; `ValueError` where one of the two is wrong.
+
+    It is constructed again, which checks its shapes: it may have been edited as a pytree.
+    """
     check_camera(f"{function}(camera)", camera)
     return check_shader(check_gbuffer(f"{function}(gbuffer)", gbuffer))
 
 
 def check_shader(gbuffer: GBuffer) -> GBuffer:
-    """The cache; `ValueError` where a shader is known and none of ours."""
+    """The cache; `ValueError` where a concrete shader is none of -1, 0, 1 and 2."""
     check("GBuffer(shader)", gbuffer.shader, lambda v: (v >= -1) & (v <= 2), "-1, 0, 1 or 2")
     return gbuffer
 
 
-def stacked(
+def stack_visibilities(
     visibilities: Sequence[_Scalars | None], surface: Surface
 ) -> Float[Array, "light height width"] | None:
-    """Those of some lights, all 1 where one has no shadows; None where none has any."""
+    """The lights' visibilities as one array, 1 for a light without; None if all are without."""
     if all(visible is None for visible in visibilities):
         return None
-    dtype, lit = surface.position.dtype, jnp.ones_like(surface.exponent)
-    return jnp.stack([lit if each is None else each.astype(dtype) for each in visibilities])
+    dtype, all_lit = surface.position.dtype, jnp.ones_like(surface.exponent)
+    return jnp.stack(
+        [all_lit if image is None else image.astype(dtype) for image in visibilities]
+    )
 
 
-def seen(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> _Vectors:
-    """What a light brings, where it is visible; a hole's visibility is not read."""
+def shadowed(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> _Vectors:
+    """A light's image times its visibility, which is not read where there is no surface."""
     if visibility is None:
         return image
     visibility = jnp.where(surface.shader == _NOTHING, 0, visibility.astype(image.dtype))
@@ -279,7 +327,7 @@ def seen(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> _Vec
 @jax.jit
 def _shade(gbuffer, camera, light, visibility):
     surface = to_surface(gbuffer, camera)
-    image = seen(surface, reflected(surface, light), visibility)
+    image = shadowed(surface, reflected(surface, light), visibility)
     return image.astype(gbuffer.color.dtype)
 
 
@@ -292,7 +340,7 @@ def _render(gbuffer, camera, lights, visibilities):
         which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
         if which:
             group = jax.tree.map(stack, *(lights[i] for i in which))
-            shadows = stacked([visibilities[i] for i in which], surface)
+            shadows = stack_visibilities([visibilities[i] for i in which], surface)
             terms = surface, image, (group, shadows)
             image = by_platform(*terms, cpu=_one_by_one, accelerator=_together)
     return image.astype(gbuffer.color.dtype)
@@ -302,28 +350,31 @@ _again = jax.checkpoint(reflected, prevent_cse=False)
 
 
 def _one_by_one(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
-    """The image with lights of a kind added, one after another."""
+    """`image` with lights of one kind added, one after another.
+
+    `terms` are the lights and their visibilities, as one pytree with a leading axis.
+    """
 
     def add(image, term):
         light, visibility = term
-        return image + seen(surface, _again(surface, light), visibility), None
+        return image + shadowed(surface, _again(surface, light), visibility), None
 
     return jax.lax.scan(add, image, terms)[0]
 
 
 def _together(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
-    """The same, some lights at a time: a launch is for all of them."""
+    """As `_one_by_one`, but `_TOGETHER` lights at a time, to save launches."""
 
     @partial(jax.checkpoint, prevent_cse=False)
-    def add(image, some):
-        bring = lambda term: seen(surface, reflected(surface, term[0]), term[1])
-        return image + jnp.sum(jax.vmap(bring)(some), axis=0), None
+    def add(image, group):
+        one = lambda term: shadowed(surface, reflected(surface, term[0]), term[1])
+        return image + jnp.sum(jax.vmap(one)(group), axis=0), None
 
     count = len(jax.tree.leaves(terms)[0])
-    whole = count - count % _TOGETHER
-    if whole:
-        groups = lambda x: x[:whole].reshape(-1, _TOGETHER, *x.shape[1:])
+    in_groups = count - count % _TOGETHER
+    if in_groups:
+        groups = lambda x: x[:in_groups].reshape(-1, _TOGETHER, *x.shape[1:])
         image, _ = jax.lax.scan(add, image, jax.tree.map(groups, terms))
-    if whole < count:
-        image, _ = add(image, jax.tree.map(lambda x: x[whole:], terms))
+    if in_groups < count:
+        image, _ = add(image, jax.tree.map(lambda x: x[in_groups:], terms))
     return image

@@ -1,8 +1,8 @@
 """Edits of one light among many.
 
-What the lights bring is kept as two sums of images, one for the diffuse reflectance to multiply
-and one for the specular. A change of light takes out what the old one brought and puts in the
-new; a change of reflectance touches no light at all.
+The state keeps two sums over the lights, of diffuse and of specular light, before the
+reflectances multiply them. An edit of a light takes out the term of the old one and adds that
+of the new one; an edit of a reflectance shades no light at all.
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,8 @@ from jaxfx._numerics import safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
-from jaxfx.relight._sums import Sums, changed, image as shaded, nothing
-from jaxfx.relight.shading import (
-    Surface,
-    checked,
-    exponent,
-    to_surface,
-)
+from jaxfx.relight._sums import Sums, image_of, sums_of_none, with_lights
+from jaxfx.relight.shading import Surface, check_cache, exponent, to_surface
 
 
 _Image = Float[Array, "height width 3"]
@@ -42,11 +37,13 @@ def start(
 ) -> "RelightState":
     """Shade every light once, and keep what an edit of one of them needs.
 
+    Its `image` is `render`'s; `edit`, `add`, `remove` and `paint` return a new state each.
+
     **Arguments:**
 
     - `gbuffer`, `camera`: as in `shade`.
-    - `lights`: a sequence of lights of any kinds; none give a black picture.
-    - `visibilities`: for each light, height width in [0, 1], or None where it has no shadows.
+    - `lights`: a sequence of lights of any kinds; without any, the image is black.
+    - `visibilities`: one per light: height width in [0, 1], or None where it has no shadows.
       None alone stands for no shadows at all.
 
     **Returns:** the `RelightState`.
@@ -55,11 +52,27 @@ def start(
 
     **Gradient:** as `shade`'s. Memory does not grow with the number of lights.
 
+    **Example:** a light is made twice as bright, then another added, then the wall darkened:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import DirectionalLight, GBuffer, OrthographicCamera, relight
+    >>> white, shader = jnp.ones((8, 8, 3)), jnp.zeros((8, 8), int)
+    >>> normal, depth = white * jnp.array([0, 0, -1]), jnp.full((8, 8), 3.0)
+    >>> wall = GBuffer(white, shader, white, white / 2, white, normal, depth, depth / 6)
+    >>> camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
+    >>> state = relight.start(wall, camera, [DirectionalLight([0, 0, 1], [1, 1, 1])])
+    >>> state = state.edit(0, DirectionalLight([0, 0, 1], [2, 2, 2]))
+    >>> state = state.add(DirectionalLight([0, 0, 1], [4, 4, 4]))
+    >>> print(state.image[4, 4], state.remove(0).image[4, 4])
+    [3. 3. 3.] [2. 2. 2.]
+    >>> print(state.paint(jnp.ones((8, 8), bool), diffuse=jnp.full(3, 0.25)).image[4, 4])
+    [1.5 1.5 1.5]
+
     Source: Pellacini et al. 2005 (Lpics), who keep the sum of the lights that are not edited.
     The two sums and their compensation (Knuth 1969, 4.2.2, theorem B) are our own.
     """
     lights = check_lights("start(lights)", lights)
-    gbuffer = checked("start", gbuffer, camera)
+    gbuffer = check_cache("start", gbuffer, camera)
     name, shape = "start(visibilities=...)", gbuffer.depth.shape
     visibilities = shares(name, visibilities, len(lights), shape)
     surface = jax.jit(to_surface)(gbuffer, camera)
@@ -68,7 +81,7 @@ def start(
         surface=surface,
         lights=(),
         visibilities=(),
-        sums=nothing(surface),
+        sums=sums_of_none(surface),
         dtype=gbuffer.color.dtype,
     )
     return _with_all(empty, lights, visibilities)
@@ -76,17 +89,17 @@ def start(
 
 @final
 class RelightState(eqx.Module):
-    """A picture under many lights, any of which may be edited for the cost of one.
+    """An image under many lights, any of which can be edited for the cost of one.
 
-    A pytree: it passes through `jit`, `vmap` and `scan`. Every method returns a new state. The
-    number of lights and their kinds are static, and so is the index of the one that is edited.
+    Made by `start`. A pytree: it passes through `jit`, `vmap` and `scan`. Every method returns
+    a new state. Static are the number and the kinds of the lights, and the index of an edit.
 
     - `color`: height width 3, the surface's base colour, linear RGB.
-    - `surface`: what the lights meet, height width; positions in scene units.
+    - `surface`: the visible surface, height width; positions in scene units.
     - `lights`: the lights.
-    - `visibilities`: for each light, height width in [0, 1], or None.
-    - `sums`: what the lights bring to each pixel; private.
-    - `dtype`: static; the type of the picture.
+    - `visibilities`: one per light: height width in [0, 1], or None.
+    - `sums`: the lights' sums per pixel; private.
+    - `dtype`: static; the type of `image`.
     """
 
     color: _Image
@@ -98,17 +111,17 @@ class RelightState(eqx.Module):
 
     @property
     def image(self) -> _Image:
-        """The picture: height width 3, linear RGB, in the type of the cache's `color`.
+        """The image: height width 3, linear RGB, in the type of the cache's `color`.
 
-        It equals `render` of the same lights but for rounding. A pixel that a light brings
-        something not finite is NaN, until that light is edited.
+        It equals `render` of the same lights but for rounding. Where a light's term is not
+        finite, the pixel is NaN until that light is edited or removed.
         """
         ambient = [
-            (light, visible)
-            for light, visible in zip(self.lights, self.visibilities, strict=True)
+            (light, visibility)
+            for light, visibility in zip(self.lights, self.visibilities, strict=True)
             if isinstance(light, AmbientLight)
         ]
-        return shaded(self.surface, self.sums, ambient).astype(self.dtype)
+        return image_of(self.surface, self.sums, ambient).astype(self.dtype)
 
     def edit(
         self,
@@ -121,23 +134,23 @@ class RelightState(eqx.Module):
     ) -> "RelightState":
         """The state with another light in place of light `i`.
 
-        It costs the shading of the old light and of the new one, however many there are, and
-        the upkeep of sums that do not drift. That pays from some ten lights on. Of fewer,
-        `render` is quicker: 8 lights took 5 ms anew and 7 ms by an edit.
+        It costs the shading of two lights, the old one and the new one, and the compensation
+        of the sums. That pays from some ten lights on. With fewer, `render` is quicker: for 8
+        lights it took 5 ms, an edit 7 ms.
 
         **Arguments:**
 
         - `i`: static; the light's index, from 0.
         - `light`: the new light, of any kind.
         - `visibility`: height width, in [0, 1], of the new light; None for no shadows. Left
-          out, it is that of the old light, shadows and all.
+          out, it is that of the old light.
 
         **Returns:** the new `RelightState`.
 
         **Raises:** `ValueError` for an index out of range, no light or a wrong shape.
 
-        **Gradient:** as `shade`'s with respect to `light` and `visibility`; with respect to
-        the state, exact: what the old light brought is taken out of the derivatives too.
+        **Gradient:** as `shade`'s with respect to `light` and `visibility`; exact with respect
+        to the state: the old light's term is taken out of the derivatives too.
         """
         i = _index(self, "edit", i)
         if isinstance(visibility, str):
@@ -147,10 +160,10 @@ class RelightState(eqx.Module):
                 )
             visibility = self.visibilities[i]
         (light,), (visibility,) = _check(self, "edit", [light], [visibility])
-        lights, visible = list(self.lights), list(self.visibilities)
-        lights[i], visible[i] = light, visibility
-        both = (self.lights[i], light), (self.visibilities[i], visibility)
-        return _changed(self, both, (-1.0, 1.0), lights, visible)
+        lights, visibilities = list(self.lights), list(self.visibilities)
+        lights[i], visibilities[i] = light, visibility
+        old_and_new = (self.lights[i], light), (self.visibilities[i], visibility)
+        return _changed(self, old_and_new, (-1.0, 1.0), lights, visibilities)
 
     def add(
         self,
@@ -159,7 +172,7 @@ class RelightState(eqx.Module):
         | Bool[ArrayLike, "height width"]
         | None = None,
     ) -> "RelightState":
-        """The state with one light more, the last.
+        """The state with one more light, at the end.
 
         **Arguments:**
 
@@ -172,9 +185,9 @@ class RelightState(eqx.Module):
 
         **Gradient:** as `shade`'s with respect to `light` and `visibility`.
         """
-        one = _check(self, "add", [light], [visibility])
+        new = _check(self, "add", [light], [visibility])
         return _changed(
-            self, one, (1.0,), [*self.lights, *one[0]], [*self.visibilities, *one[1]]
+            self, new, (1.0,), [*self.lights, *new[0]], [*self.visibilities, *new[1]]
         )
 
     def remove(self, i: int) -> "RelightState":
@@ -190,8 +203,8 @@ class RelightState(eqx.Module):
         """
         i = _index(self, "remove", i)
         without = lambda values: [*values[:i], *values[i + 1 :]]
-        one = (self.lights[i],), (self.visibilities[i],)
-        return _changed(self, one, (-1.0,), without(self.lights), without(self.visibilities))
+        old = (self.lights[i],), (self.visibilities[i],)
+        return _changed(self, old, (-1.0,), without(self.lights), without(self.visibilities))
 
     def paint(
         self,
@@ -204,8 +217,8 @@ class RelightState(eqx.Module):
     ) -> "RelightState":
         """The state with another material in some pixels.
 
-        Another `color`, `diffuse` or `specular` is a product with what the lights have
-        brought already: no light is shaded. Another `roughness` shades all of them again.
+        A new `color`, `diffuse` or `specular` multiplies the sums over the lights: no light is
+        shaded. A new `roughness` shades all of them again.
 
         **Arguments:**
 
@@ -213,7 +226,7 @@ class RelightState(eqx.Module):
         - `color`: 3, linear RGB. `ambient` and `diffuse` keep their ratio to it; where it was
           0, they become it.
         - `diffuse`, `specular`: 3, linear RGB. The specular reflectance of a Lambert surface
-          is not seen.
+          has no effect.
         - `roughness`: a scalar, in [0, 1].
 
         **Returns:** the new `RelightState`.
@@ -222,20 +235,20 @@ class RelightState(eqx.Module):
 
         **Gradient:** exact with respect to every new value.
         """
-        where = as_array("paint(mask)", mask)
-        if where.shape != self.color.shape[:2]:
+        mask = as_array("paint(mask)", mask)
+        if mask.shape != self.color.shape[:2]:
             raise ValueError(
                 f"`paint(mask)` must have the cache's height and width "
-                f"{self.color.shape[:2]}, got {where.shape}."
+                f"{self.color.shape[:2]}, got {mask.shape}."
             )
-        if where.dtype != jnp.bool_:
-            raise ValueError(f"`paint(mask)` must hold booleans, got {where.dtype}.")
-        where, state, surface = where[..., None], self, self.surface
+        if mask.dtype != jnp.bool_:
+            raise ValueError(f"`paint(mask)` must hold booleans, got {mask.dtype}.")
+        mask, state, surface = mask[..., None], self, self.surface
         if color is not None:
-            new = jnp.where(where, _vector(self, "color", color), self.color)
+            new = jnp.where(mask, _vector(self, "color", color), self.color)
             ratio = safe_divide(new, self.color)
-            tinted = lambda was: jnp.where(
-                where, jnp.where(self.color == 0, new, was * ratio), was
+            tinted = lambda old: jnp.where(
+                mask, jnp.where(self.color == 0, new, old * ratio), old
             )
             surface = surface._replace(
                 ambient=tinted(surface.ambient), diffuse=tinted(surface.diffuse)
@@ -243,61 +256,65 @@ class RelightState(eqx.Module):
             state = eqx.tree_at(lambda s: s.color, state, new)
         if diffuse is not None:
             surface = surface._replace(
-                diffuse=jnp.where(where, _vector(self, "diffuse", diffuse), surface.diffuse)
+                diffuse=jnp.where(mask, _vector(self, "diffuse", diffuse), surface.diffuse)
             )
         if specular is not None:
-            shiny = where & (surface.shader > 0)[..., None]
+            is_shiny = mask & (surface.shader > 0)[..., None]
             surface = surface._replace(
-                specular=jnp.where(shiny, _vector(self, "specular", specular), surface.specular)
+                specular=jnp.where(
+                    is_shiny, _vector(self, "specular", specular), surface.specular
+                )
             )
         state = eqx.tree_at(lambda s: s.surface, state, surface)
         if roughness is None:
             return state
         value = share("paint(roughness=...)", roughness, ()).astype(self.color.dtype)
-        sharper = jnp.where(where[..., 0], exponent(value), surface.exponent)
-        surface = surface._replace(exponent=sharper)
-        bare = eqx.tree_at(
+        exponents = jnp.where(mask[..., 0], exponent(value), surface.exponent)
+        surface = surface._replace(exponent=exponents)
+        unlit = eqx.tree_at(
             lambda s: (s.surface, s.sums, s.lights, s.visibilities),
             state,
-            (surface, nothing(surface), (), ()),
+            (surface, sums_of_none(surface), (), ()),
         )
-        return _with_all(bare, self.lights, self.visibilities)
+        return _with_all(unlit, self.lights, self.visibilities)
 
 
-# Functions, for a call of a method costs equinox a look at every light.
+# Functions, not methods: to call a method of a pytree, Equinox visits every leaf.
 
 
 def _vector(state: RelightState, name: str, value: Any) -> Float[Array, "1 1 3"]:
+    """An argument of `paint` as a colour that broadcasts over pixels."""
     return parameter(f"paint({name}=...)", value, (3,)).astype(state.color.dtype)[None, None]
 
 
 def _index(state: RelightState, method: str, i: Any) -> int:
+    """The index of one of the state's lights; `ValueError` otherwise."""
     count = len(state.lights)
     index = whole_number(f"{method}(i)", i, lambda n: True, "a static integer")
     return whole_number(f"{method}(i)", index, lambda n: 0 <= n < count, f"in [0, {count})")
 
 
 def _check(
-    state: RelightState, method: str, lights: Sequence[Any], visibility: Sequence[Any]
+    state: RelightState, method: str, lights: Sequence[Any], visibilities: Sequence[Any]
 ) -> tuple[tuple[Light, ...], tuple[_Visibility | None, ...]]:
-    """Lights and visibilities in the type of the sums."""
+    """Lights and visibilities in the type of the sums; `ValueError` names a wrong one."""
     dtype, shape = state.color.dtype, state.color.shape[:2]
     for light in lights:
         check_light(f"{method}(light)", light)
     cast = lambda leaf: leaf.astype(dtype)
     images = (
         None if image is None else share(f"{method}(visibility)", image, shape).astype(dtype)
-        for image in visibility
+        for image in visibilities
     )
     return tuple(jax.tree.map(cast, tuple(lights))), tuple(images)
 
 
 def _with_all(
-    state: RelightState, lights: Sequence[Light], visibility: Sequence[Any]
+    state: RelightState, lights: Sequence[Light], visibilities: Sequence[Any]
 ) -> RelightState:
-    """The state with all of these lights more."""
-    all_of_them = _check(state, "start", lights, visibility)
-    return _changed(state, all_of_them, (1.0,) * len(lights), *all_of_them)
+    """A state without lights, with all of these added."""
+    terms = _check(state, "start", lights, visibilities)
+    return _changed(state, terms, (1.0,) * len(lights), *terms)
 
 
 def _changed(
@@ -305,15 +322,18 @@ def _changed(
     terms: tuple[tuple[Light, ...], tuple[_Visibility | None, ...]],
     signs: tuple[float, ...],
     lights: Sequence[Light],
-    visibility: Sequence[_Visibility | None],
+    visibilities: Sequence[_Visibility | None],
 ) -> RelightState:
-    """The state with `terms` put in or taken out, which holds `lights` then."""
+    """The state after `terms`, lights and their visibilities, are added or taken out by sign.
+
+    `lights` and `visibilities` are those of the new state.
+    """
     signs_array = jnp.asarray(signs, state.color.dtype)
     return RelightState(
         color=state.color,
         surface=state.surface,
         lights=tuple(lights),
-        visibilities=tuple(visibility),
-        sums=changed(state.surface, state.sums, *terms, signs_array),
+        visibilities=tuple(visibilities),
+        sums=with_lights(state.surface, state.sums, *terms, signs_array),
         dtype=state.dtype,
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Literal, NamedTuple
 
 import jax
@@ -128,7 +128,7 @@ def _synthesize(gbuffers, cameras, target, depth, *, tolerance, angle, weighting
     ]
     agrees, shader = _agreement(samples, tolerance, angle)
     is_used = [mask & point.is_known for mask in agrees]
-    views = sum(mask.astype(jnp.int32) for mask in is_used)
+    views = reduce(jnp.add, [mask.astype(jnp.int32) for mask in is_used])
     is_covered = views > 0
     weights = [
         jnp.where(mask, s.detail if weighting == "detail" else jnp.ones_like(s.detail), 0)

@@ -83,8 +83,8 @@ def receivers(
     >>> from jaxfx import OrthographicCamera, shadow
     >>> camera = OrthographicCamera(1.0, [4, 4], jnp.eye(4))
     >>> light_camera = OrthographicCamera(2.0, [8, 8], jnp.eye(4).at[2, 3].set(-2))
-    >>> seen = shadow.receivers(jnp.full((8, 8), 4.0), camera, light_camera)
-    >>> float(seen.u[0, 0]), float(seen.z[0, 0])
+    >>> receivers = shadow.receivers(jnp.full((8, 8), 4.0), camera, light_camera)
+    >>> float(receivers.u[0, 0]), float(receivers.z[0, 0])
     (1.0, 6.0)
 
     Source: Williams 1978, section 3; the offset is Holbert 2011's, the slope what is now known

@@ -51,12 +51,12 @@ def test_groups_of_lights_and_what_is_left_over(more):
 def test_both_searches_across_find_the_same_pixel(share):
     """Wider than the first pass reaches: distances by SciPy, and equal ones broken alike."""
     rng = np.random.default_rng(0)
-    covered = rng.random((40, 4 * holes._NEAR)) < share
+    covered = rng.random((40, 4 * holes._NEAR_COLUMNS)) < share
     both = []
     for search in (holes._widening, holes._in_two_passes):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(holes, "by_platform", lambda *x, cpu, accelerator, f=search: f(*x))
-            both.append(holes._nearest(jnp.asarray(covered), jnp.asarray(~covered)))
+            both.append(holes._nearest_covered(jnp.asarray(covered), jnp.asarray(~covered)))
     (found, near), (same, other) = both
     np.testing.assert_array_equal(found, same)
     assert found.all() == covered.any()

@@ -135,7 +135,8 @@ def test_an_earlier_run_is_drawn_again(out, tmp_path, monkeypatch, capsys):
 PARTS = {
     *("Accumulation", "binomial_weights", "linear_taps", "Candidates", "Receivers"),
     *("candidates", "receivers", "light_cameras", "Choice", "Hit", "choose"),
-    *("MovingShadow", "RelightState", "capture_normals", "shade"),
+    *("MovingShadow", "RelightState", "Synthesis", "FilledCache", "LinearTaps"),
+    *("capture_normals", "shade"),
 }
 
 

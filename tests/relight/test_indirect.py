@@ -1,4 +1,4 @@
-"""Light by way of other surfaces, against a plain loop over points."""
+"""Light reflected by other surfaces, against a plain loop over points."""
 
 import inspect
 
@@ -52,10 +52,10 @@ def irradiance(light, place, normal):
     if isinstance(light, AmbientLight):
         return np.zeros(3)
     if isinstance(light, DirectionalLight):
-        way = -np.asarray(light.direction)
-        return np.asarray(light.color) * max(normal @ way / np.linalg.norm(way), 0)
-    way = np.asarray(light.position) - place
-    return np.asarray(light.color) * max(normal @ way, 0) / np.linalg.norm(way) ** 3
+        to_light = -np.asarray(light.direction)
+        return np.asarray(light.color) * max(normal @ to_light / np.linalg.norm(to_light), 0)
+    to_light = np.asarray(light.position) - place
+    return np.asarray(light.color) * max(normal @ to_light, 0) / np.linalg.norm(to_light) ** 3
 
 
 def test_is_the_sum_over_points():

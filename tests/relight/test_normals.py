@@ -1,4 +1,4 @@
-"""Normals from pictures, against those that the pictures were made with."""
+"""Normals from images, against those that the images were made with."""
 
 import numpy as np
 import pytest

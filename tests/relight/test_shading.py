@@ -175,7 +175,7 @@ def test_both_modes_equal_finite_differences(camera, light):
 
 @pytest.mark.parametrize("shader", [1, 2])
 def test_sharp_highlights_and_narrow_cones_in_float32(shader):
-    """Where 1e-7 of a cosine, one rounding, is 2e-3 of the picture."""
+    """Where 1e-7 of a cosine, one rounding, is 2e-3 of the image."""
     width = 12
     angles = np.linspace(0.001, 0.02, width)[None]
     one = np.ones((1, width, 3))
@@ -198,7 +198,7 @@ FIELDS = ("ambient", "diffuse", "specular", "normal", "depth", "roughness")
 
 @jax.jit
 def image_and_slopes(gbuffer, camera, lights):
-    """A picture and the derivatives of its sum in all that makes it."""
+    """An image and the derivatives of its sum in all that makes it."""
     arguments, others = eqx.partition((gbuffer, camera, lights), eqx.is_inexact_array)
     image = lambda arguments: relight.render(*eqx.combine(arguments, others))
     out, pull = jax.vjp(image, arguments)
@@ -404,7 +404,7 @@ def test_an_unknown_shader_is_named_or_black():
     assert not jax.jit(relight.shade)(one_pixel(3), FRONT, LIGHTS["ambient"]).any()
 
 
-def test_faults_name_the_argument():
+def test_errors_name_the_argument():
     shade, render = inspect.unwrap(relight.shade), inspect.unwrap(relight.render)
     gbuffer, camera, light = make_gbuffer(0), make_camera("pinhole", 7, 9), LIGHTS["point"]
     kinds = "AmbientLight, DirectionalLight, PointLight, SpotLight"

@@ -1,4 +1,4 @@
-"""Edits against the picture rendered afresh, over long chains, bad lights and derivatives."""
+"""Edits against the image rendered afresh, over long chains, bad lights and derivatives."""
 
 import inspect
 
@@ -71,7 +71,7 @@ def fresh(state, gbuffer=GBUFFER):
 
 
 def assert_close(image, expected, tolerance=1e-12):
-    """Within a tolerance of the picture's range."""
+    """Within a tolerance of the image's range."""
     limit = tolerance * float(jnp.max(expected))
     np.testing.assert_allclose(image, expected, rtol=0, atol=limit)
 
@@ -443,7 +443,7 @@ def test_errors_name_the_argument():
 
 @pytest.mark.full
 def test_what_is_rendered_anew_is_what_is_edited():
-    """The two pictures that the benchmark times are the same, shadows and all."""
+    """The two images that the benchmark times are the same, shadows and all."""
     mesh, camera = relight_scenes.view((24, 32))
     lights = relight_scenes.lights(2)
     image = relight_scenes.rendered_anew(mesh, camera, lights, (24, 32))

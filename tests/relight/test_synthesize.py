@@ -311,7 +311,7 @@ def new_view(caches, count, degrees):
 @first("degrees", [5, 15, 30])
 @pytest.mark.full
 def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
-    """PSNR of every parameter, ids exact, and the relit picture, filled and outside holes."""
+    """PSNR of every parameter, ids exact, and the relit image, filled and outside holes."""
     shares = []
     for count in (1, 2, 4, 8):
         target, truth, found, views = new_view(caches, count, degrees)
@@ -332,9 +332,9 @@ def test_more_caches_leave_fewer_holes_and_are_right_outside(caches, degrees):
         assert int(holes) == (shown & ~seen).sum()
         assert (np.asarray(filled.shader)[shown] >= 0).all()
         lights = scene.default_lights(target)
-        pictures = [relight.render(each, target, lights) for each in (truth, found, filled)]
-        assert psnr(pictures[2], pictures[0]) >= psnr(pictures[1], pictures[0])
-        assert psnr(pictures[1], pictures[0], seen) > 20
+        images = [relight.render(each, target, lights) for each in (truth, found, filled)]
+        assert psnr(images[2], images[0]) >= psnr(images[1], images[0])
+        assert psnr(images[1], images[0], seen) > 20
     assert shares == sorted(shares) and shares[0] > 0.4
     assert shares[-1] > {5: 0.98, 15: 0.95, 30: 0.8}[degrees]
 

@@ -22,7 +22,7 @@ def stage():
 
 
 def all_of(stage, shadows):
-    """Mitsuba's picture under all lights."""
+    """Mitsuba's image under all lights."""
     mesh, camera, _ = stage
     each = [truth.direct(mesh, camera, v, SIZE, shadows=shadows) for v in truth.LIGHTS.values()]
     return np.sum(each, axis=0)

@@ -17,17 +17,17 @@ def test_a_size_that_is_not_odd_is_refused(case, name, size):
         function(*case, size=size)
 
 
-def test_other_faults_name_their_argument(case):
+def test_other_errors_name_their_argument(case):
     pcf = inspect.unwrap(shadow.pcf)
     shadow_map, receivers = case
-    faults = {
+    errors = {
         "shadow_map": ((shadow_map[0], receivers), {}),
         "receivers": ((shadow_map, receivers._replace(u=receivers.u[:2])), {}),
         "kernel=...": (case, {"kernel": "disc"}),
         "softness=...": (case, {"softness": 0.0}),
         "bias=...": (case, {"bias": np.zeros(2)}),
     }
-    for name, (data, options) in faults.items():
+    for name, (data, options) in errors.items():
         with pytest.raises(ValueError) as caught:
             pcf(*data, size=3, **options)
         assert str(caught.value).startswith(f"`pcf({name})`")

@@ -72,7 +72,7 @@ def test_gradients_reach_the_light():
     np.testing.assert_allclose(jax.grad(eye)(POINT).position, [1, 2, 3])
 
 
-def test_faults_name_their_argument():
+def test_errors_name_their_argument():
     function = inspect.unwrap(shadow.light_cameras)
     wide = SpotLight([0, 0, 0], [0, 0, 1], WHITE, 0.5, 1.6)
     for name, light, options in (

@@ -89,7 +89,7 @@ def test_screen_mask_loses_a_shadow_between_pixels():
 
 
 def test_screen_mask_loses_an_edge_beyond_the_frame():
-    """The filter reaches the plate's ends, which the picture does not show."""
+    """The filter reaches the plate's ends, which the image does not show."""
     case = plate(8.0, 16)
     assert (shadow.edge_pcf(*case, size=7, edges="screen") == 0).all()
     assert shadow.pcf(*case, size=7).max() == pytest.approx(1 / 7)
@@ -132,7 +132,7 @@ def test_derivatives_are_pcfs():
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
-def test_faults_name_their_argument(case):
+def test_errors_name_their_argument(case):
     function = inspect.unwrap(shadow.edge_pcf)
     for name, options in {
         "size=...": {"size": 4},

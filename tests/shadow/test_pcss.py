@@ -82,7 +82,7 @@ def test_reverse_mode_matches_differences():
         assert float(slope) == pytest.approx(float(ahead - behind) / 2e-6, rel=1e-4, abs=1e-6)
 
 
-def test_faults_name_their_argument(case):
+def test_errors_name_their_argument(case):
     function = inspect.unwrap(shadow.pcss)
     camera = PinholeCamera.from_fov(1.0, height=8, width=8)
     for name, options in (("size", {"size": 2}), ("light_size", {"light_size": 0.0})):

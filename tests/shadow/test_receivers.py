@@ -183,17 +183,17 @@ def test_derivatives_reach_depth_and_light_through_every_soft_form(form):
         assert float(program(at, along)[1]) == pytest.approx(expected, rel=1e-4)
 
 
-def test_faults_name_their_argument():
+def test_errors_name_their_argument():
     function = inspect.unwrap(shadow.receivers)
     camera, depth = eye_camera(), np.ones((HEIGHT, WIDTH))
-    faults = [
+    errors = [
         ("depth", (np.ones(3), camera, camera), {}),
         ("light_camera", (depth, camera, ()), {}),
         ("light_camera", (depth, camera, (camera, sun_camera())), {}),
         ("normal=...", (depth, camera, camera), {"normal": depth}),
         ("normal_offset=...", (depth, camera, camera), {"normal_offset": depth}),
     ]
-    for name, data, options in faults:
+    for name, data, options in errors:
         with pytest.raises(ValueError) as caught:
             function(*data, **options)
         assert str(caught.value).startswith(f"`receivers({name})`")

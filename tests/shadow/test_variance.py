@@ -66,7 +66,7 @@ def test_reverse_mode_matches_differences(case):
     assert float(slopes[0].sum() + slopes[1]) == pytest.approx(expected, rel=1e-5)
 
 
-def test_faults_name_their_argument(case):
+def test_errors_name_their_argument(case):
     function = inspect.unwrap(shadow.variance)
     for name, options in (("size", {"size": 2}), ("min_variance", {"min_variance": -1.0})):
         with pytest.raises(ValueError) as caught:
