@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import (
     WholeNumber,
     as_array,

@@ -20,10 +20,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arguments import check_camera
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_numpy, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
 from jaxfx._numerics import inverse, working_dtype
@@ -41,7 +41,7 @@ SKY = (1e10, 65504.0)
 def clean(
     depth: Num[ArrayLike, "height width"],
     *,
-    scale: Num[ArrayLike, ""] = 1.0,
+    scale: Num[ArrayLike, ""] | float | int = 1.0,
     sky: tuple[float | int, ...] | None = None,
 ) -> Float[Array, "height width"]:
     """Depth in scene units and in this module's convention, from numbers as a file stores them.
@@ -82,8 +82,8 @@ def clean(
 def from_disparity(
     disparity: Num[ArrayLike, "height width"],
     *,
-    scale: Num[ArrayLike, ""],
-    shift: Num[ArrayLike, ""] = 0.0,
+    scale: Num[ArrayLike, ""] | float | int,
+    shift: Num[ArrayLike, ""] | float | int = 0.0,
 ) -> Float[Array, "height width"]:
     """Depth from inverse depth up to scale and shift, as networks for one image predict it.
 
@@ -126,9 +126,9 @@ def from_disparity(
 def from_stereo(
     disparity: Num[ArrayLike, "height width"],
     *,
-    focal_pixels: Num[ArrayLike, ""],
-    baseline: Num[ArrayLike, ""],
-    offset: Num[ArrayLike, ""] = 0.0,
+    focal_pixels: Num[ArrayLike, ""] | float | int,
+    baseline: Num[ArrayLike, ""] | float | int,
+    offset: Num[ArrayLike, ""] | float | int = 0.0,
 ) -> Float[Array, "height width"]:
     """Depth from the disparity of a rectified pair of cameras.
 

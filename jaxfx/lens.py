@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Protocol, final, runtime_checkable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
 from jaxfx._numerics import absolute, clip01, working_dtype
 from jaxfx.camera import PinholeCamera
@@ -17,7 +17,7 @@ from jaxfx.camera import PinholeCamera
 __all__ = ["FocusPlanes", "Lens", "ThinLens"]
 
 # Depths as people have them: arrays, numbers and lists, of floats or integers.
-_Depths = Num[ArrayLike, "*shape"] | Sequence[Any]
+_Depths = Num[ArrayLike, "*shape"] | float | int | Sequence[Any]
 
 
 @runtime_checkable

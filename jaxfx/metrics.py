@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array, check, check_image, is_concrete, option, parameter
 from jaxfx._numerics import working_dtype
 

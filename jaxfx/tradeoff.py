@@ -22,10 +22,10 @@ import jax
 import jax.core
 import jax.stages
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfx import metrics
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check_image, number, whole_number
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, write_whole

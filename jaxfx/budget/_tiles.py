@@ -12,8 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+
+from jaxfx._arrays import ArrayLike
 
 
 # The side of a tile, in pixels: a larger tile draws more pixels than need be, smaller ones take

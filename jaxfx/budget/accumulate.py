@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
-from jax.typing import ArrayLike
 
 from jaxfx._arguments import check_camera, check_lens
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, as_numpy
 from jaxfx.budget._search import check_call, plan
 from jaxfx.budget.plan import Plan

@@ -5,10 +5,10 @@ from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float, Num
 
 from jaxfx._arguments import check_lens
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check_depth, check_image, option
 from jaxfx.budget._octaves import octaves
 from jaxfx.budget._search import Part, Search, Trial, check_call, plan

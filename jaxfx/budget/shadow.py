@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, parameter
 from jaxfx.budget._search import Search, Trial, check_call, plan, timed
 from jaxfx.budget._tiles import blocks, spend

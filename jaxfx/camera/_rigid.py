@@ -6,9 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, check_fields, check_map, parameter
 from jaxfx._numerics import common_dtype, inverse, normalize, working_dtype
 from jaxfx._sampling import pixel_centers
@@ -17,7 +17,7 @@ from jaxfx._sampling import pixel_centers
 # Points, pixels and depths as people have them: arrays, numbers and lists, integers too.
 Points = Num[ArrayLike, "... 3"] | Sequence[Any]
 Pixels = Num[ArrayLike, "... 2"] | Sequence[Any]
-Depths = Num[ArrayLike, "..."] | Sequence[Any]
+Depths = Num[ArrayLike, "..."] | float | int | Sequence[Any]
 DepthMap = Num[ArrayLike, "height width"] | Sequence[Any]
 
 # How far a rotation's columns may be from orthonormal: files hold four digits.

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_camera, check_lens
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check_image, parameter, whole_number
 from jaxfx._numerics import safe_sqrt, working_dtype
 from jaxfx._progress import counted

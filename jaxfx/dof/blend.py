@@ -6,9 +6,9 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number
 from jaxfx._filter import folded
 from jaxfx._linear import linear

@@ -5,9 +5,9 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, whole_number
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof.arguments import check_arguments, defocused, with_own

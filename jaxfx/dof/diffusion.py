@@ -12,9 +12,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
 from jaxfx._platform import by_platform
 from jaxfx.dof.arguments import Defocused, check_arguments, defocused

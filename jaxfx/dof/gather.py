@@ -5,9 +5,9 @@ import functools as ft
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check, parameter, whole_number
 from jaxfx._numerics import absolute, clip01
 from jaxfx._platform import by_platform

@@ -6,9 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, check_depth, check_image, is_concrete, items, parameter
 from jaxfx._numerics import clip01, sum_planes
 from jaxfx.dof.arguments import check_arguments, compiled, defocused, with_own

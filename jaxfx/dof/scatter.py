@@ -6,9 +6,9 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, option, parameter
 from jaxfx._platform import either
 from jaxfx.dof.arguments import check_arguments, largest_of, pixels, with_own

@@ -5,9 +5,9 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
 from jaxfx._numerics import absolute
 from jaxfx._platform import by_platform

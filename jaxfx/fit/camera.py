@@ -7,10 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import (
     Number,
     WholeNumber,

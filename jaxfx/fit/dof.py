@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._progress import Bar
 from jaxfx.fit import _lens_arguments as read

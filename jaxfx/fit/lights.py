@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_lights
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import (
     WholeNumber,
     check,

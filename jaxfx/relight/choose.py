@@ -5,9 +5,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._choice import Choice
 from jaxfx._numerics import safe_divide

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int
 
 from jaxfx._arguments import check_gbuffer
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array
 from jaxfx._platform import by_platform
 from jaxfx.gbuffer import GBuffer

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check_image
 from jaxfx._numerics import normalize
 from jaxfx.light import DirectionalLight

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, share, shares
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._platform import by_platform

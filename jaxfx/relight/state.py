@@ -11,10 +11,11 @@ from typing import Any, Literal, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike, DTypeLike
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._arguments import check_light, check_lights
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array, parameter, share, shares, whole_number
 from jaxfx._numerics import safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -213,7 +214,7 @@ class RelightState(eqx.Module):
         color: Float[ArrayLike, "3"] | None = None,
         diffuse: Float[ArrayLike, "3"] | None = None,
         specular: Float[ArrayLike, "3"] | None = None,
-        roughness: Float[ArrayLike, ""] | None = None,
+        roughness: Float[ArrayLike, ""] | float | None = None,
     ) -> "RelightState":
         """The state with another material in some pixels.
 

@@ -7,9 +7,9 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, number, option
 from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers

@@ -6,9 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
 from jaxfx._choice import Choice
 from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype

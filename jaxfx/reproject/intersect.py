@@ -4,9 +4,9 @@ from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, option, parameter, whole_number
 from jaxfx._numerics import working_dtype
 from jaxfx.reproject._search import first_crossing

@@ -3,10 +3,10 @@
 from typing import Any
 
 import equinox as eqx
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check_image, number, parameter, whole_number
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers

@@ -4,10 +4,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_light
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, parameter, whole_number
 from jaxfx._numerics import normalize
 from jaxfx.camera import OrthographicCamera, PinholeCamera

@@ -6,9 +6,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num, UInt32
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, is_concrete, option, whole_number
 from jaxfx.shadow._at_edges import filtered_at_edges
 from jaxfx.shadow._edges import find_edges

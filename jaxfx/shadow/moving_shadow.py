@@ -5,10 +5,10 @@ from typing import Any, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_light
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, check_map, parameter, whole_number
 from jaxfx._numerics import clip01
 from jaxfx._sampling import pixel_centers

@@ -3,9 +3,9 @@
 import functools as ft
 
 import jax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber
 from jaxfx.shadow.arguments import filter_arguments
 from jaxfx.shadow.compare import (

@@ -5,10 +5,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, parameter
 from jaxfx._numerics import absolute, clip01, safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera

@@ -5,9 +5,9 @@ import functools as ft
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Num
 
+from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, parameter
 from jaxfx._numerics import safe_divide
 from jaxfx._sampling import bilinear
