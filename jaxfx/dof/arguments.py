@@ -169,6 +169,6 @@ def with_own(
     image: Float[Array, "height width channel"],
     missing: Bool[Array, "height width"],
 ) -> Float[Array, "height width value"]:
-    """Sums of colours and, last, of weights; missing pixels get their own colour, weighted `OWN`."""
+    """Sums of colours and of weights; missing pixels get their own colour, weighted `OWN`."""
     own = OWN * jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
     return sums + jnp.where(missing[..., None], own, 0)
