@@ -31,7 +31,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from jaxfx import ThinLens, dof, io, metrics, reproject, scene, tradeoff
 from jaxfx._pyramid import minimum_pyramid
-from jaxfx.reproject import _grid, _walk
+from jaxfx.reproject import _crossings, _traversal
 
 
 sys.path.append("..")
@@ -102,15 +102,15 @@ place = np.arange(size) + 0.5
 profile = 0.75 + 0.1 * np.sin(place / 7)
 profile[21:23], profile[49:] = 0.3, 0.45
 field = jnp.asarray(np.broadcast_to(profile, (size, size)).copy())
-r = _grid.rays(jnp.array([[2.0, 31.5, 0.0]]), jnp.array([[60.0, 0.0, 0.62]]))
+r = _crossings.grid_rays(jnp.array([[2.0, 31.5, 0.0]]), jnp.array([[60.0, 0.0, 0.62]]))
 tree = minimum_pyramid(field)
-begin = _grid.entry(r, size, size)
-left, up = _grid.backward(r)
-state = _walk.pack(begin.x, begin.y, jnp.array([len(tree.shapes) - 1]), left, up)
-step, cells = jax.jit(_walk.step), []
+begin = _crossings.entry_texel(r, size, size)
+left, up = _crossings.backward_axes(r)
+state = _traversal.pack(begin.x, begin.y, jnp.array([len(tree.shapes) - 1]), left, up)
+step, cells = jax.jit(_traversal.step), []
 while True:
-    x, y, level, *_ = (int(v[0]) for v in _walk.unpack(state))
-    if level >= _walk.MISS:
+    x, y, level, *_ = (int(v[0]) for v in _traversal.unpack(state))
+    if level >= _traversal.MISS:
         break
     cells.append((x >> level, level, float(tree.level(level)[y >> level, x >> level])))
     state = step(tree, r, state)

@@ -17,7 +17,9 @@ from jaxfx.budget._search import Search, check_call
 from jaxfx.budget._tiles import Blocks, allowed, blocks, spend, sums, tile_of
 from jaxfx.budget.plan import Plan
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.reproject.blend import Sight, blend, check_sources
+from jaxfx.reproject.arguments import check_images
+from jaxfx.reproject.blend import blend
+from jaxfx.reproject.view import trace_with_angle
 
 
 _OPTIONS = {"search": "pyramid", "hole_threshold": 0.1}
@@ -136,7 +138,7 @@ def reproject(
     It costs two renderings of all sources, one for the proof and one apart, one by the plan,
     and about one more to compare what is left out.
     """
-    data = check_sources("reproject", images, depths, cameras, target)
+    data = check_images("reproject", images, depths, cameras, target)
     images, depths, cameras, _ = data
     max_error = check_call("reproject", max_error, data)
     search = Search(Everything(*_sides(height, width)), data, max_error)
@@ -225,7 +227,6 @@ def _sampled(
 
     `parts` are those of `_chosen`, `size` is height and width of the result.
     """
-    options = _OPTIONS | {"max_steps": max_steps}
     points, shown = pixel_centers(*size).reshape(-1, 2), []
     for members, *of_each in parts:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)
@@ -233,8 +234,10 @@ def _sampled(
         def block(item, stacked=stacked):
             source, pixels = item
             image, depth, camera = jax.tree.map(lambda x: x[source], stacked)
-            rays = Sight(target, points.at[pixels].get(mode="clip"), options)
-            view, along, z = rays(depth, camera)
+            centers = points.at[pixels].get(mode="clip")
+            view, along, z = trace_with_angle(
+                depth, camera, target, centers, max_steps=max_steps, **_OPTIONS
+            )
             color = view.patch.read_colors(image)
             return Samples(pixels, color, view.mask, along, z, view.steps)
 

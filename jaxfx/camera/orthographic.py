@@ -11,7 +11,7 @@ from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_num
 from jaxfx._numerics import normalize, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera._records import Projection, Rays
-from jaxfx.camera._rigid import (
+from jaxfx.camera.rigid import (
     DepthMap,
     Depths,
     Pixels,

@@ -12,7 +12,7 @@ from jaxfx._numerics import inverse, normalize, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import _conventions
 from jaxfx.camera._records import Projection, Rays
-from jaxfx.camera._rigid import (
+from jaxfx.camera.rigid import (
     DepthMap,
     Depths,
     Pixels,

@@ -12,7 +12,7 @@ from jaxfx._sampling import bilinear, nearest, pixel_centers
 from jaxfx.camera import PinholeCamera
 from jaxfx.fit._exposure import exposure_between
 from jaxfx.fit._robust import huber
-from jaxfx.reproject._view import look
+from jaxfx.reproject.view import trace_pixels
 
 
 # The margin of an image that is not compared, in pixels: a blur there lacks what is outside.
@@ -95,7 +95,7 @@ class Residual(eqx.Module):
         pixels = self._thinned(pixel_centers(rows, columns, views.depth.dtype))
         size, flat = pixels.shape[:2], pixels.reshape(-1, 2)
         options = {"search": "pyramid", "hole_threshold": self.hole_threshold}
-        view = look(views.depth, views.source, camera, flat, **options)
+        view = trace_pixels(views.depth, views.source, camera, flat, **options)
         is_clear = view.mask & nearest(self.clear, view.pixels)
         ignored = (~is_clear.reshape(size) | is_frame(size)).astype(float)
         counts = 1 - largest(jax.lax.stop_gradient(ignored))
@@ -106,7 +106,7 @@ class Residual(eqx.Module):
         differences = [(gain * shown + offset - reference) / scale[0]]
         if views.reference_depth is not None:
             own_depth = self._thinned(views.reference_depth)
-            depth = safe_divide(jnp.ones_like(view.inverse_depth), view.inverse_depth)
+            depth = safe_divide(jnp.ones_like(view.inverse_depth), -view.inverse_depth)
             point = views.source.unproject(view.pixels, depth)
             point = jnp.where(view.mask[:, None], point, 0)
             seen_depth = camera.project(point)[1].reshape(size)

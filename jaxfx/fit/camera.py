@@ -28,7 +28,7 @@ from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._pose_residual import Residual, Views, report
 from jaxfx.fit._pose_search import search
 from jaxfx.fit._robust import huber
-from jaxfx.reproject.warp import check_options, check_source
+from jaxfx.reproject.arguments import check_image_depth, check_threshold
 
 
 # What a pose must meet to be called a success: the least ratio of pixels that both images show,
@@ -192,11 +192,11 @@ def camera(
     """
     views = _views(reference, reference_depth, image, depth, camera, start)
     max_steps = whole_number("camera(max_steps=...)", max_steps)
-    check_options("camera", (None, None), views.reference.shape[:2], "pyramid", hole_threshold)
+    hole_threshold = check_threshold("camera", hole_threshold)
     option("camera(exposure=...)", exposure, get_args(Exposure))
     with Bar(progress, "fit") as bar:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
-        model, end = search(views, float(hole_threshold), exposure == "free", descend_on)
+        model, end = search(views, hole_threshold, exposure == "free", descend_on)
     fitted = _fitted(model, end)
     if throw:
         check_success(fitted, "camera", "pose")
@@ -234,7 +234,7 @@ def _views(
         check_camera(f"camera({name})", value, PinholeCamera)
     image = check_image("camera(image)", image)
     reference = check_image("camera(reference)", reference)
-    depth = check_source("camera", depth, image.shape[:2])
+    depth = check_image_depth("camera", depth, image.shape[:2])
     if reference.shape[2] != image.shape[2]:
         raise ValueError(
             f"`camera(reference)` must have the image's {image.shape[2]} channels, "

@@ -1,14 +1,15 @@
-"""The view rays of a target camera in the projected space of a source camera.
+"""The rays of a target camera's pixels, in the coordinates (x, y, -1/z) of another camera.
 
-A line of the world stays a line in (x, y, -1 / z). A point at depth s along the target's pixel
-p has the source's homogeneous pixel s m + b. For a pinhole, b is its eye and m = M p, with M
-the matrix of the two cameras at infinity. M is kept as its difference from the identity, which
-is 0 for two equal cameras: their rays then stay on their pixels, without rounding.
+A line of the world is a line in (x, y, -1/z). The point at depth s of a target pixel p has the
+homogeneous pixel s m + b in the other camera. For a pinhole target, m = M p, with M the matrix
+between the two image planes at infinity: m is the vanishing point of the ray. b is the eye of
+the target. M is stored as its difference from the identity, which is 0 for two equal cameras:
+their rays then stay on their pixels, without rounding.
 
-As s grows the point moves along m b_z - b m_z in x and y, and along m_z in -1 / z. This needs
-no two points of the line, whose difference has no digits left where one is at the near plane
-and the other far away. Lengths are in units of the near plane's depth, which holds the numbers
-of any scene within the range of float32.
+With growing s the point moves along m b_z - b m_z in x and y, and along m_z in -1/z. Two points
+of the line are not needed; their difference would have no digits left where one is at the near
+plane and the other far away. Lengths are in units of the near plane's depth, which keeps the
+numbers of any scene within the range of float32.
 """
 
 from typing import NamedTuple
@@ -18,18 +19,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import inverse
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import Camera, PinholeCamera
 
 
-Camera = PinholeCamera | OrthographicCamera
+# Three coordinates, each an array over rays.
 _Point = tuple[Array, Array, Array]
 
 
 class ViewRays(NamedTuple):
-    """Rays in (x, y, -unit / z), and which of them are in the frustum.
+    """Rays origin + t direction in (x, y, -unit/z), clipped to the frustum of the camera.
 
-    Those that run away from the source have their origin at their far end, and go from t = -1
-    to 0; the others from 0 to 1.
+    - `origin`, `direction`: x and y in pixels. Rays that run away from the camera have their
+      origin at their far end: t goes from -1 to 0. For the others t goes from 0 to 1.
+    - `inside`: whether any of the ray is in the frustum; where not, both are 0.
     """
 
     origin: Float[Array, "ray 3"]
@@ -38,67 +40,77 @@ class ViewRays(NamedTuple):
 
 
 def view_rays(
-    source: PinholeCamera,
+    camera: PinholeCamera,
     target: Camera,
     pixels: Float[Array, "ray 2"],
     *,
-    shape: tuple[int, int],
+    height: int,
+    width: int,
     unit: Float[Array, ""],
 ) -> ViewRays:
-    """The rays of some target pixels, clipped to the source's frustum beyond a depth `unit`."""
-    far, eye = _lines(source, target, pixels, unit)
-    begin, end = _clip(far, eye, shape)
-    length = _length(far, eye, begin, end)
-    # A ray that is none has finite factors: its derivative, 0 times them, is then 0.
+    """The rays of some target pixels, clipped to the camera's frustum beyond a depth `unit`."""
+    vanishing, eye = _homogeneous_lines(camera, target, pixels, unit)
+    begin, end = _clip(vanishing, eye, height, width)
+    length = _length(vanishing, eye, begin, end)
+    # Outside the frustum all factors are finite: the derivative, 0 times them, is then 0.
     is_ray = (begin < end) & jnp.isfinite(length)
-    direction = _direction(far, eye) * jnp.where(is_ray, length, 0)[:, None]
+    direction = _direction(vanishing, eye) * jnp.where(is_ray, length, 0)[:, None]
     runs_away = jax.lax.stop_gradient(direction[:, 2]) > 0
-    origin = _point(far, eye, jnp.where(is_ray, jnp.where(runs_away, end, begin), 1))
+    origin_depth = jnp.where(is_ray, jnp.where(runs_away, end, begin), 1)
+    origin = _point_at(vanishing, eye, origin_depth)
     inside = is_ray & jnp.isfinite(origin + direction).all(axis=-1)
     origin, direction = (jnp.where(inside[:, None], x, 0) for x in (origin, direction))
     return ViewRays(origin, direction, inside)
 
 
-def _lines(
-    source: PinholeCamera, target: Camera, pixels: Array, unit: Array
+def _homogeneous_lines(
+    camera: PinholeCamera, target: Camera, pixels: Array, unit: Array
 ) -> tuple[_Point, _Point]:
-    """What is multiplied by the depth in the target, and what is added: m and b."""
+    """m and b of the module's docstring, per ray: the target's depth is multiplied by m."""
     dtype = pixels.dtype
-    lens, turn = (
-        source.intrinsics.astype(dtype),
-        source.world_from_camera[:3, :3].T.astype(dtype),
+    intrinsics, camera_from_world = (
+        camera.intrinsics.astype(dtype),
+        camera.world_from_camera[:3, :3].T.astype(dtype),
     )
     pose = target.world_from_camera.astype(dtype)
-    away = (pose[:3, 3] - source.world_from_camera[:3, 3].astype(dtype)) / unit
+    offset = (pose[:3, 3] - camera.world_from_camera[:3, 3].astype(dtype)) / unit
     x, y = pixels[:, 0], pixels[:, 1]
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
-    apart = turn @ (pose[:3, :3] - turn.T)
+    # The rotation between the cameras, less the identity.
+    difference = camera_from_world @ (pose[:3, :3] - camera_from_world.T)
     if isinstance(target, PinholeCamera):
-        target_lens = target.intrinsics.astype(dtype)
-        apart = ((lens - target_lens) + lens @ apart) @ inverse(target_lens)
-        own, eye, plane = (x, y, one), lens @ (turn @ away), (zero, zero)
+        target_intrinsics = target.intrinsics.astype(dtype)
+        difference = (intrinsics - target_intrinsics) + intrinsics @ difference
+        difference = difference @ inverse(target_intrinsics)
+        identity, eye = (x, y, one), intrinsics @ (camera_from_world @ offset)
+        plane = (zero, zero)
     else:
-        apart = lens @ (apart + jnp.eye(3, dtype=dtype))
-        own, eye = (zero, zero, zero), lens @ (turn @ away)
-        scale, centre = target.pixels_per_unit.astype(dtype), target.center.astype(dtype)
-        plane = (x - centre[0]) / scale / unit, (y - centre[1]) / scale / unit
+        # Rays are parallel: m is the same for all, b depends on the point of the image plane.
+        difference = intrinsics @ (difference + jnp.eye(3, dtype=dtype))
+        identity, eye = (zero, zero, zero), intrinsics @ (camera_from_world @ offset)
+        scale, center = target.pixels_per_unit.astype(dtype), target.center.astype(dtype)
+        plane = (x - center[0]) / scale / unit, (y - center[1]) / scale / unit
         x, y = zero, zero
-    far_x, far_y, far_z = (
-        row[0] * x + row[1] * y + row[2] + its for row, its in zip(apart, own, strict=True)
+    m_x, m_y, m_z = (
+        row[0] * x + row[1] * y + row[2] + same
+        for row, same in zip(difference, identity, strict=True)
     )
-    near_x, near_y, near_z = (
-        row[0] * plane[0] + row[1] * plane[1] + e for row, e in zip(apart, eye, strict=True)
+    b_x, b_y, b_z = (
+        row[0] * plane[0] + row[1] * plane[1] + e
+        for row, e in zip(difference, eye, strict=True)
     )
-    return (far_x, far_y, far_z), (near_x, near_y, near_z)
+    return (m_x, m_y, m_z), (b_x, b_y, b_z)
 
 
-def _clip(far: _Point, eye: _Point, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """From which target depth to which a line is in the frustum: a r + b >= 0 for each side."""
-    height, width = shape
+def _clip(vanishing: _Point, eye: _Point, height: int, width: int) -> tuple[Array, Array]:
+    """The target depths between which lines are in the frustum. Held constant.
+
+    For each plane of the frustum a point is inside where `growth` * depth + `at_eye` >= 0.
+    """
     hold = jax.lax.stop_gradient
-    x, y, z = map(hold, far)
+    x, y, z = map(hold, vanishing)
     eye_x, eye_y, eye_z = map(hold, eye)
-    sides = [
+    planes = [
         (x, eye_x),
         (width * z - x, width * eye_z - eye_x),
         (y, eye_y),
@@ -106,33 +118,35 @@ def _clip(far: _Point, eye: _Point, shape: tuple[int, int]) -> tuple[Array, Arra
         (z, eye_z - 1),
     ]
     begin, end = jnp.zeros_like(x), jnp.full_like(x, jnp.inf)
-    for grows, at_eye in sides:
-        crossing = -at_eye / jnp.where(grows == 0, 1, grows)
-        begin = jnp.where(grows > 0, jnp.maximum(begin, crossing), begin)
-        end = jnp.where(grows < 0, jnp.minimum(end, crossing), end)
-        end = jnp.where((grows == 0) & (at_eye < 0), -jnp.inf, end)
+    for growth, at_eye in planes:
+        crossing = -at_eye / jnp.where(growth == 0, 1, growth)
+        begin = jnp.where(growth > 0, jnp.maximum(begin, crossing), begin)
+        end = jnp.where(growth < 0, jnp.minimum(end, crossing), end)
+        end = jnp.where((growth == 0) & (at_eye < 0), -jnp.inf, end)
     return begin, end
 
 
-def _direction(far: _Point, eye: _Point) -> Float[Array, "ray 3"]:
-    """Which way (x, y, -1 / z) of the source changes with the depth in the target."""
-    (x, y, z), (eye_x, eye_y, eye_z) = far, eye
+def _direction(vanishing: _Point, eye: _Point) -> Float[Array, "ray 3"]:
+    """The direction in (x, y, -1/z) in which points move with growing target depth."""
+    (x, y, z), (eye_x, eye_y, eye_z) = vanishing, eye
     return jnp.stack((x * eye_z - eye_x * z, y * eye_z - eye_y * z, z), axis=-1)
 
 
-def _length(far: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, " ray"]:
-    """How many times `_direction` lies between two depths of the target; held constant."""
+def _length(vanishing: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, " ray"]:
+    """The multiple of `_direction` between two target depths. Held constant."""
     hold = jax.lax.stop_gradient
-    z, eye_z = hold(far[2]), hold(eye[2])
-    inverse = 1 / end
-    start, stop = z * begin + eye_z, z + inverse * eye_z
-    return (1 - begin * inverse) / (jnp.maximum(start, 1) * stop)
+    z, eye_z = hold(vanishing[2]), hold(eye[2])
+    inverse_end = 1 / end
+    z_begin, z_end = z * begin + eye_z, z + inverse_end * eye_z
+    return (1 - begin * inverse_end) / (jnp.maximum(z_begin, 1) * z_end)
 
 
-def _point(far: _Point, eye: _Point, depth: Array) -> Float[Array, "ray 3"]:
-    """(x, y, -1 / z) of the source at a depth of the target, 0 and infinity among them."""
-    at_eye = depth == 0
-    inverse = 1 / jnp.where(at_eye, 1, depth)
-    x, y, z = (jnp.where(at_eye, e, f + inverse * e) for f, e in zip(far, eye, strict=True))
+def _point_at(vanishing: _Point, eye: _Point, target_depth: Array) -> Float[Array, "ray 3"]:
+    """(x, y, -1/z) at a depth of the target, which may be 0 or infinite."""
+    is_eye = target_depth == 0
+    reciprocal = 1 / jnp.where(is_eye, 1, target_depth)
+    x, y, z = (
+        jnp.where(is_eye, e, v + reciprocal * e) for v, e in zip(vanishing, eye, strict=True)
+    )
     z = jnp.where(z > 0, z, 1)
-    return jnp.stack([x / z, y / z, -jnp.where(at_eye, 1, inverse) / z], axis=-1)
+    return jnp.stack([x / z, y / z, -jnp.where(is_eye, 1, reciprocal) / z], axis=-1)

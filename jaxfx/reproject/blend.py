@@ -1,4 +1,4 @@
-"""One image from several cameras, and which of many cameras to take."""
+"""Views out of several cameras: blend them, or choose those that are worth it."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,20 +9,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, WholeNumber, check_image, check_map, items, whole_number
+from jaxfx._checks import Number, WholeNumber, check_map, whole_number
 from jaxfx._choice import Choice
-from jaxfx._numerics import normalize, safe_divide, sum_planes, working_dtype
+from jaxfx._numerics import safe_divide, sum_planes
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import PinholeCamera
-from jaxfx.camera._rigid import per_depth
-from jaxfx.reproject._rays import Camera
-from jaxfx.reproject._view import View, look
-from jaxfx.reproject.intersect import Search
-from jaxfx.reproject.warp import check_cameras, check_options, check_source
+from jaxfx.camera import Camera, PinholeCamera
+from jaxfx.reproject.arguments import (
+    Search,
+    check_depths,
+    check_images,
+    check_lengths,
+    check_search,
+    check_size,
+    check_threshold,
+)
+from jaxfx.reproject.view import trace_with_angle
 
 
-# `choose` looks with one ray for so many pixels of a side.
+# Pixels. `choose` traces one ray for each square of this side. A larger one is cheaper, and may
+# overlook what a camera shows in places smaller than it; `worth` is then a coarser mean.
 _STRIDE = 8
 
 
@@ -37,58 +43,79 @@ def blend(
     search: Search = "pyramid",
     hole_threshold: Number = 0.1,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
-    """A picture from another camera out of several: each `warp`ed, the nearer surface first.
+    """One image from another camera out of several images, which fill each other's holes.
 
-    Where several sources know a pixel, those whose surface lies within `hole_threshold` of the
-    nearest are averaged, each by the cosine of the angle at which its ray meets the target's
-    there, to its eighth power: who looks the same way counts most.
+    Each image is warped as by `warp`; per pixel the nearest surface is shown.
 
     **Arguments:**
 
-    - `images`: pictures, each height width channel, linear radiance.
+    - `images`: images, each height width channel, linear radiance.
     - `depths`: the depth of each, height width, scene units, as in `warp`.
     - `cameras`: the camera of each.
     - `target`: the camera to see them from.
-    - `height`, `width`: static; size of the result in pixels, both or neither; the first
-      image's by default.
+    - `height`, `width`: static; of the result, in pixels, both or none: the first image's by
+      default.
     - `search`, `hole_threshold`: as in `warp`; the latter a ratio of depths.
 
     **Returns:** `image`, rows columns channel, and `alpha`, rows columns, as `warp` does.
 
-    **Raises:** `ValueError` as `warp`, and for no sources or lists of different lengths.
+    **Raises:** `ValueError` as `warp`, and for no cameras or lists of different lengths.
 
     **Gradient:** as that of `warp`; the weights and the choice of the nearer surface are held.
+
+    **Example:** two images with one camera are averaged.
+
+    >>> import numpy as np
+    >>> from jaxfx import PinholeCamera, reproject
+    >>> dark, bright = np.zeros((8, 8, 3), np.float32), np.ones((8, 8, 3), np.float32)
+    >>> depth = np.full((8, 8), 2.0, np.float32)
+    >>> camera = PinholeCamera.from_fov(1.0, height=8, width=8)
+    >>> image, alpha = reproject.blend([dark, bright], [depth] * 2, [camera] * 2, camera)
+    >>> image.shape, float(image[4, 4, 0])
+    ((8, 8, 3), 0.5)
+
+    Images whose surface lies within `hole_threshold` of the nearest are averaged. The weight of
+    each is the cosine of the angle at which its ray meets the target's there, to the eighth
+    power: a camera that looks the same way has the largest.
 
     Source: the several references that Kim, Ki, Lee & Oh name as future work; the weights are
     our own.
     """
-    given = check_sources("blend", images, depths, cameras, target)
-    images, depths, cameras, target = given
-    size = check_options("blend", (height, width), images[0].shape[:2], search, hole_threshold)
-    options = {"search": search, "hole_threshold": float(hole_threshold)}
-    seen = Sight(target, pixel_centers(*size).reshape(-1, 2), options)
-    return _blended(seen, images, depths, cameras, size)
+    images, depths, cameras, target = check_images("blend", images, depths, cameras, target)
+    size = check_size("blend", height, width, images[0].shape[:2])
+    check_search("blend", search)
+    hole_threshold = check_threshold("blend", hole_threshold)
+    return _blended(images, depths, cameras, target, size, search, hole_threshold)
 
 
 @eqx.filter_jit
 def _blended(
-    seen: "Sight", images: list, depths: list, cameras: list, size: tuple[int, int]
+    images: list,
+    depths: list,
+    cameras: list,
+    target: Camera,
+    size: tuple[int, int],
+    search: str,
+    hole_threshold: int | float,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
-    hole_threshold = seen.options["hole_threshold"]
+    """`blend` of checked arguments; `size` is height and width of the result, in pixels."""
+    pixels = pixel_centers(*size).reshape(-1, 2)
+    options = {"search": search, "hole_threshold": hole_threshold}
 
-    def layer(image: Array, depth: Array, camera: PinholeCamera) -> tuple[Array, ...]:
-        view, along, z = seen(depth, camera)
-        return view.patch.read_colors(image).astype(images[0].dtype), view.mask, along, z
+    def warped(image: Array, depth: Array, camera: PinholeCamera) -> tuple[Array, ...]:
+        view, cosine, target_depth = trace_with_angle(depth, camera, target, pixels, **options)
+        colors = view.patch.read_colors(image).astype(images[0].dtype)
+        return colors, view.mask, cosine, target_depth
 
-    pictures, masks, along, z = _over_sources(layer, images, depths, cameras)
-    nearest = jnp.min(jnp.where(masks, z, jnp.inf), axis=0)
-    front = masks & (z <= (1 + hole_threshold) * nearest[None])
-    weight = jax.lax.stop_gradient(jnp.where(front, along**8, 0))[..., None]
-    weight = weight.astype(pictures.dtype)
-    total = sum_planes(jnp.where(weight > 0, pictures, 0) * weight)
-    weights = jnp.broadcast_to(sum_planes(weight), total.shape)
-    alpha = (weights[:, 0] > 0).astype(total.dtype)
-    return safe_divide(total, weights).reshape(*size, -1), alpha.reshape(size)
+    colors, mask, cosine, target_depth = _over_cameras(warped, images, depths, cameras)
+    nearest = jnp.min(jnp.where(mask, target_depth, jnp.inf), axis=0)
+    is_in_front = mask & (target_depth <= (1 + hole_threshold) * nearest[None])
+    weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0))[..., None]
+    weight = weight.astype(colors.dtype)
+    total = sum_planes(jnp.where(weight > 0, colors, 0) * weight)
+    weight_sum = jnp.broadcast_to(sum_planes(weight), total.shape)
+    alpha = (weight_sum[:, 0] > 0).astype(total.dtype)
+    return safe_divide(total, weight_sum).reshape(*size, -1), alpha.reshape(size)
 
 
 def choose(
@@ -101,20 +128,17 @@ def choose(
     width: WholeNumber | None = None,
     hole_threshold: Number = 0.1,
 ) -> Choice:
-    """The few sources that together show most of a target.
+    """The few cameras that together show most of a target's view, the most useful first.
 
-    The worth of a source at a pixel is the cosine between its ray and the target's to what the
-    pixel shows, 0 where it shows nothing; that of several is the best of theirs, summed over
-    pixels. One after another is added that adds most, which is at least 63 % of the best choice
-    of so many. Looked at with one ray for each 8 x 8 pixels.
+    Use it to render or load only the images that `blend` needs.
 
     **Arguments:**
 
     - `depths`: the depth of each camera, height width, scene units, as in `warp`.
-    - `cameras`: the camera of each.
+    - `cameras`: the cameras to choose from.
     - `target`: the camera to see them from.
     - `count`: static; how many to choose.
-    - `height`, `width`: static; size of the target in pixels, both or neither; the first
+    - `height`, `width`: static; of the target's image, in pixels, both or none: the first
       depth's by default.
     - `hole_threshold`: static; as in `warp`, a ratio of depths.
 
@@ -125,107 +149,79 @@ def choose(
     **Gradient:** of `worth`, with respect to depths and cameras, through what each pixel shows;
     missing: visibility and the choice itself.
 
-    Source: Nemhauser, Wolsey & Fisher 1978, the greedy choice's bound; the worth is our own.
+    **Example:** the camera at the target's place shows all of it.
+
+    >>> import numpy as np
+    >>> from jaxfx import PinholeCamera, reproject
+    >>> aside = np.eye(4)
+    >>> aside[0, 3] = 1.0
+    >>> target = PinholeCamera.from_fov(1.0, height=8, width=8)
+    >>> other = PinholeCamera.from_fov(1.0, height=8, width=8, world_from_camera=aside)
+    >>> depth = np.full((8, 8), 2.0, np.float32)
+    >>> choice = reproject.choose([depth, depth], [other, target], target, count=1)
+    >>> choice.chosen.tolist(), round(float(choice.worth[0]), 3)
+    ([1], 1.0)
+
+    The worth of a camera at a pixel is the cosine between its ray and the target's to the
+    surface that the pixel shows, 0 where it shows none; that of several cameras is the largest
+    of theirs, averaged over one ray for each 8 x 8 pixels. Greedily, the camera that adds most
+    is chosen next. That is at least 63 % of the worth of the best choice of `count` cameras.
+
+    Source: Nemhauser, Wolsey & Fisher 1978, the bound of the greedy choice; the worth is our
+    own.
     """
-    _check_lists("choose", depths=depths, cameras=cameras)
+    check_lengths("choose", depths=depths, cameras=cameras)
     most = len(cameras)
     is_valid = lambda n: 1 <= n <= most
     count = whole_number("choose(count=...)", count, is_valid, f"an integer from 1 to {most}")
     depths = [check_map("choose(depths)", depth) for depth in depths]
-    size = check_options("choose", (height, width), depths[0].shape, "pyramid", hole_threshold)
+    size = check_size("choose", height, width, depths[0].shape)
+    hole_threshold = check_threshold("choose", hole_threshold)
     rows, columns = (slice(min(_STRIDE, n) // 2, None, _STRIDE) for n in size)
     pixels = pixel_centers(*size)[rows, columns].reshape(-1, 2)
-    depths = _checked("choose", depths, [depth.shape for depth in depths], cameras, target)
-    options = {"search": "pyramid", "hole_threshold": float(hole_threshold)}
-    return _chosen(Sight(target, pixels, options), depths, list(cameras), count)
+    shapes = [depth.shape for depth in depths]
+    depths = check_depths("choose", depths, shapes, cameras, target)
+    return _chosen(depths, list(cameras), target, pixels, count, hole_threshold)
 
 
 @eqx.filter_jit
-def _chosen(seen: "Sight", depths: list, cameras: list, count: int) -> Choice:
-    def each(depth: Array, camera: PinholeCamera) -> Array:
-        view, along, _ = seen(depth, camera)
-        return jnp.where(view.mask, along, 0)
+def _chosen(
+    depths: list,
+    cameras: list,
+    target: Camera,
+    pixels: Array,
+    count: int,
+    hole_threshold: int | float,
+) -> Choice:
+    """`choose` of checked arguments, by rays through `pixels` of the target, ray 2."""
+    options = {"search": "pyramid", "hole_threshold": hole_threshold}
 
-    worth, chosen = _over_sources(each, depths, cameras), []
-    best, reached = jnp.zeros_like(worth[0]), []
-    free = jnp.ones(len(worth), bool)
+    def worth(depth: Array, camera: PinholeCamera) -> Array:
+        view, cosine, _ = trace_with_angle(depth, camera, target, pixels, **options)
+        return jnp.where(view.mask, cosine, 0)
+
+    worths = _over_cameras(worth, depths, cameras)
+    best, chosen, reached = jnp.zeros_like(worths[0]), [], []
+    is_free = jnp.ones(len(worths), bool)
     for _ in range(count):
-        together = jnp.maximum(worth, best[None])
-        index = jnp.argmax(jnp.where(free, jnp.sum(together, axis=1), -jnp.inf))
-        best, free = together[index], free.at[index].set(False)
+        best_with = jnp.maximum(worths, best[None])
+        index = jnp.argmax(jnp.where(is_free, jnp.sum(best_with, axis=1), -jnp.inf))
+        best, is_free = best_with[index], is_free.at[index].set(False)
         chosen.append(index.astype(jnp.int32))
         reached.append(jnp.mean(best))
     return Choice(jnp.stack(chosen), jnp.stack(reached))
 
 
-def check_sources(
-    caller: str, images: Any, depths: Any, cameras: Any, target: Any
-) -> tuple[list[Array], list[Array], list[PinholeCamera], Camera]:
-    """Pictures, depths and cameras, as lists; `ValueError` names a fault."""
-    _check_lists(caller, images=images, depths=depths, cameras=cameras)
-    images = [check_image(f"{caller}(images)", image) for image in images]
-    depths = _checked(caller, depths, [image.shape[:2] for image in images], cameras, target)
-    return images, depths, list(cameras), target
+def _over_cameras(function: Callable, *lists: Sequence) -> Any:
+    """The results for each camera, stacked.
 
-
-def _check_lists(caller: str, **lists: Any) -> None:
-    expected = "a sequence with an item for each source"
-    lengths = {
-        name: len(items(f"{caller}({name})", values, expected))
-        for name, values in lists.items()
-    }
-    if len(set(lengths.values())) > 1 or 0 in lengths.values():
-        name = next(iter(lists))
-        raise ValueError(
-            f"`{caller}({name})` must have an item for each camera, at least one, "
-            f"got lengths {lengths}."
-        )
-
-
-def _checked(
-    caller: str, depths: Sequence, shapes: Sequence, cameras: Sequence, target: Any
-) -> list[Array]:
-    """The depths as arrays of the given shapes, in types that are computed with."""
-    depths = [check_source(caller, *each) for each in zip(depths, shapes, strict=True)]
-    for camera in cameras:
-        check_cameras(caller, camera, target)
-    return [depth.astype(working_dtype(depth.dtype)) for depth in depths]
-
-
-def _over_sources(function: Callable, *lists: Sequence) -> Any:
-    """The results, stacked; sources that are alike in all shapes and types share a program."""
-    kinds = {str(jax.tree.map(jax.typeof, each)) for each in zip(*lists, strict=True)}
+    If all items of each list have the same shapes and types, they share one compiled program.
+    """
+    kinds = {str(jax.tree.map(jax.typeof, items)) for items in zip(*lists, strict=True)}
     stack = lambda *leaves: jnp.stack(leaves)
     if len(kinds) == 1:
         stacked = tuple(jax.tree.map(stack, *items) for items in lists)
-        in_turn = lambda *each: jax.lax.map(lambda one: function(*one), each)
+        in_turn = lambda *batch: jax.lax.map(lambda items: function(*items), batch)
         return by_platform(*stacked, cpu=in_turn, accelerator=jax.vmap(function))
-    results = [function(*each) for each in zip(*lists, strict=True)]
+    results = [function(*items) for items in zip(*lists, strict=True)]
     return jax.tree.map(stack, *results)
-
-
-class Sight(eqx.Module):
-    """What some of a target's pixels see of a source."""
-
-    target: Camera
-    pixels: Float[Array, "ray 2"]
-    options: dict[str, Any] = eqx.field(static=True)
-
-    def __call__(
-        self, depth: Float[Array, "height width"], camera: PinholeCamera
-    ) -> tuple[View, Float[Array, " ray"], Float[Array, " ray"]]:
-        """The view, the cosine between the source's rays and the target's, and its depth."""
-        pixels = self.pixels.astype(depth.dtype)
-        view = look(depth, camera, self.target, pixels, **self.options)
-        rays, others = per_depth(camera, view.pixels), per_depth(self.target, pixels)
-        cosine = jnp.sum(normalize(rays) * normalize(others), axis=-1)
-        # No point of the world: its square overflows where a sky is at 1e20.
-        at_infinity = view.inverse_depth <= 0
-        poses = camera.world_from_camera, self.target.world_from_camera
-        axis, away = poses[1][:3, 2], poses[0][:3, 3] - poses[1][:3, 3]
-        along, offset = (
-            jnp.sum(v * axis[None].astype(v.dtype), axis=-1)
-            for v in (rays, away[None].astype(rays.dtype))
-        )
-        there = along / jnp.where(at_infinity, 1, view.inverse_depth) + offset
-        return view, jnp.maximum(cosine, 0), jnp.where(at_infinity, jnp.inf, there)

@@ -1,20 +1,22 @@
-"""The picture of one camera as another would take it."""
-
-from typing import Any
+"""The image of one camera as another camera would see it."""
 
 import equinox as eqx
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arguments import check_camera
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, WholeNumber, check_image, number, parameter, whole_number
+from jaxfx._checks import Number, WholeNumber, check_image
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import PinholeCamera
-from jaxfx.reproject._rays import Camera
-from jaxfx.reproject._view import look
-from jaxfx.reproject._walk import LARGEST
-from jaxfx.reproject.intersect import Search, check_search
+from jaxfx.camera import Camera, PinholeCamera
+from jaxfx.reproject.arguments import (
+    Search,
+    check_image_depth,
+    check_search,
+    check_size,
+    check_threshold,
+)
+from jaxfx.reproject.view import trace_pixels
 
 
 def warp(
@@ -28,32 +30,24 @@ def warp(
     search: Search = "pyramid",
     hole_threshold: Number = 0.1,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
-    """A picture with depth, from another camera: what it shows, and where it shows something.
+    """An image with depth, seen from another camera, and a mask of the pixels that it shows.
 
-    The ray of every target pixel is taken to (x, y, -1 / z) of the source, where lines stay
-    lines, and clipped to the source's frustum; where it meets the depth, through the patch of
-    the texels' centres, the picture is read, bilinearly and inside one surface. Its cost does
-    not depend on how complex the scene is. With the source's own camera the picture returns
-    unchanged. Depth inf is a surface at infinity: a sky turns with the camera.
-
-    It knows one layer: what the source did not see stays empty. It has the source's sharpness,
-    its aliasing and its highlights, and does not antialias where it draws smaller. A thin thing
-    seen from its side is as thick as the source saw it wide.
+    The cost does not depend on how complex the scene is. With the image's own camera the image
+    returns unchanged.
 
     **Arguments:**
 
     - `image`: height width channel, linear radiance.
-    - `depth`: height width, scene units along the source's axis, inf for background. What is 0,
+    - `depth`: height width, scene units along the camera's axis, inf for background. What is 0,
       negative or NaN is missing: a hole, at whose border a surface ends. Rays pass through it
       to what is known beyond, and nothing is read from it.
-    - `camera`: the camera that took the picture, a pinhole.
+    - `camera`: the camera of the image, a pinhole.
     - `target`: the camera to see it from, a pinhole or an orthographic one.
-    - `height`, `width`: static; size of the result in pixels, both or neither; the image's own
-      by default.
-    - `search`: as in `intersect`.
+    - `height`, `width`: static; of the result, in pixels, both or none: the image's by default.
+    - `search`: how rays find the surface, as in `intersect`; "pyramid" is exact.
     - `hole_threshold`: static; the step in depth between neighbours, as a ratio to the nearer
       one's depth, above which they are two surfaces with a gap between them. Smaller makes
-      holes in slanted surfaces, larger draws skins between things.
+      holes in slanted surfaces, larger draws skins between objects.
 
     **Returns:** `image`, rows columns channel, in the type of `image`, 0 where nothing is
     known; and `alpha`, rows columns: 1, or 0 where the ray leaves the frustum, goes through a
@@ -66,67 +60,55 @@ def warp(
     point that each pixel shows; second derivatives are not. Missing: visibility. What comes
     into sight at a silhouette, or leaves it, has no derivative, nor has `alpha`.
 
-    Source: Kim, Ki, Lee & Oh, image reprojection on the GPU; the walls as holes, the exact
-    identity and the derivative are our own.
+    **Example:** the camera moves to the right, past a plane; a column comes into sight.
+
+    >>> import numpy as np
+    >>> from jaxfx import PinholeCamera, reproject
+    >>> image, depth = np.ones((8, 8, 3), np.float32), np.full((8, 8), 2.0, np.float32)
+    >>> camera = PinholeCamera.from_fov(1.0, height=8, width=8)
+    >>> pose = np.eye(4)
+    >>> pose[0, 3] = 0.3
+    >>> target = PinholeCamera.from_fov(1.0, height=8, width=8, world_from_camera=pose)
+    >>> moved, alpha = reproject.warp(image, depth, camera, target)
+    >>> moved.shape, int(alpha.sum())
+    ((8, 8, 3), 56)
+
+    The ray of each target pixel is transformed to (x, y, -1/z) of `camera`, where lines stay
+    lines, and clipped to the frustum. Where it meets the depth, on the bilinear patch of the
+    texel centres, the image is read, bilinearly and within one surface. A depth of inf is a
+    surface at infinity: a sky turns with the camera.
+
+    There is one layer: what the camera did not see stays empty. The result has the image's
+    sharpness, aliasing and highlights, and is not antialiased where it is drawn smaller. A thin
+    object seen from its side is as thick as the camera saw it wide.
+
+    Source: Kim, Ki, Lee & Oh, image reprojection on the GPU; gaps as holes, the exact identity
+    and the derivative are our own.
     """
     image = check_image("warp(image)", image)
-    depth = check_source("warp", depth, image.shape[:2])
-    check_cameras("warp", camera, target)
-    shape = check_options("warp", (height, width), image.shape[:2], search, hole_threshold)
-    return _drawn(image, depth, camera, target, shape, search, float(hole_threshold))
+    depth = check_image_depth("warp", depth, image.shape[:2])
+    check_camera("warp(camera)", camera, PinholeCamera)
+    check_camera("warp(target)", target)
+    size = check_size("warp", height, width, image.shape[:2])
+    check_search("warp", search)
+    hole_threshold = check_threshold("warp", hole_threshold)
+    return _warped(image, depth, camera, target, size, search, hole_threshold)
 
 
 @eqx.filter_jit
-def _drawn(
+def _warped(
     image: Array,
     depth: Array,
     camera: PinholeCamera,
     target: Camera,
-    shape: tuple[int, int],
+    size: tuple[int, int],
     search: str,
     hole_threshold: int | float,
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
-    dtype = working_dtype(depth.dtype)
-    pixels = pixel_centers(*shape, dtype).reshape(-1, 2)
+    """`warp` of checked arguments; `size` is height and width of the result, in pixels."""
+    depth = depth.astype(working_dtype(depth.dtype))
+    pixels = pixel_centers(*size, depth.dtype).reshape(-1, 2)
     options = {"search": search, "hole_threshold": hole_threshold}
-    view = look(depth.astype(dtype), camera, target, pixels, **options)
-    drawn = view.patch.read_colors(image)
-    return drawn.reshape(*shape, -1), view.mask.astype(image.dtype).reshape(shape)
-
-
-def check_source(caller: str, depth: Any, shape: tuple[int, ...]) -> Array:
-    """`depth` as a float array of `shape`, whatever it holds; `ValueError` otherwise."""
-    array = parameter(f"{caller}(depth)", depth, None)
-    if array.shape != shape or max(shape) > LARGEST:
-        raise ValueError(
-            f"`{caller}(depth)` must have the image's height and width {shape}, each at most "
-            f"{LARGEST}, got {array.shape}."
-        )
-    return array
-
-
-def check_cameras(caller: str, camera: Any, target: Any) -> None:
-    """Raise `ValueError` for cameras of a kind that is not served."""
-    check_camera(f"{caller}(camera)", camera, PinholeCamera)
-    check_camera(f"{caller}(target)", target)
-
-
-def check_options(
-    caller: str,
-    size: tuple[Any, Any],
-    default: tuple[int, ...],
-    search: str,
-    hole_threshold: Any,
-) -> tuple[int, int]:
-    """The height and width of the result; `ValueError` for an option out of range."""
-    check_search(caller, search)
-    number(f"{caller}(hole_threshold=...)", hole_threshold, expected="a positive number")
-    if size == (None, None):
-        size = default[0], default[1]
-    for name, side, other in zip(("height", "width"), size, size[::-1], strict=True):
-        if side is None:
-            raise ValueError(
-                f"`{caller}({name}=...)` must be given with the other one, {other}, got None."
-            )
-        whole_number(f"{caller}({name}=...)", side, expected="a positive integer, in pixels")
-    return int(size[0]), int(size[1])
+    view = trace_pixels(depth, camera, target, pixels, **options)
+    colors = view.patch.read_colors(image)
+    return colors.reshape(*size, -1), view.mask.astype(image.dtype).reshape(size)

@@ -14,7 +14,7 @@ from jaxfx._checks import check, check_map, items, parameter
 from jaxfx._numerics import absolute, normalize, safe_divide, safe_sqrt, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
-from jaxfx.camera._rigid import at_origin, per_depth
+from jaxfx.camera.rigid import at_origin, per_depth
 
 
 _Image = Float[Array, "height width"]

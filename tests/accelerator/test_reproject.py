@@ -15,7 +15,7 @@ from tests.reproject.test_intersect import (  # noqa: F401
     test_the_derivative_is_that_of_the_closed_form,
     test_under_vmap_every_ray_finds_the_same_in_as_many_steps,
 )
-from tests.reproject.test_walk import test_a_bound_on_steps_is_kept_and_said  # noqa: F401
+from tests.reproject.test_traversal import test_a_bound_on_steps_is_kept_and_said  # noqa: F401
 from tests.reproject.test_warp import (  # noqa: F401
     test_derivatives_of_the_pose_and_the_depth_are_the_difference_quotients,
     test_under_vmap_and_in_any_shape,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes.reproject import run, slanted_rays
-from jaxfx.reproject import _walk, intersect
+from jaxfx.reproject import _traversal, intersect
 from tests.cases.reproject import awkward_rays, field, grid_walk
 from tests.helpers.forms import first
 
@@ -32,11 +32,11 @@ def check_exact(hit, depth, origin, direction, tolerance):
     return found
 
 
-@pytest.mark.parametrize(("count", "together"), [(9000, _walk._TOGETHER), (9001, 4000)])
+@pytest.mark.parametrize(("count", "together"), [(9000, _traversal._BATCH_RAYS), (9001, 4000)])
 @pytest.mark.full
 def test_many_rays_go_on_in_parts_and_thirds(count, together, monkeypatch):
     # Of another number, or JAX would take the program that it has traced before.
-    monkeypatch.setattr(_walk, "_TOGETHER", together)
+    monkeypatch.setattr(_traversal, "_BATCH_RAYS", together)
     rng = np.random.default_rng(5)
     depth = field((64, 64), rng)
     origin = rng.uniform((0, 0, 0), (64, 64, 0.1), (count, 3))

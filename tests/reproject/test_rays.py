@@ -25,7 +25,7 @@ def test_a_ray_is_the_line_that_its_pixel_sees(kind):
     source, target = camera(), TARGETS[kind]
     rng = np.random.default_rng(0)
     pixels = jnp.asarray(rng.uniform(0, 1, (200, 2)) * [WIDTH, HEIGHT])
-    rays = view_rays(source, target, pixels, shape=(HEIGHT, WIDTH), unit=jnp.asarray(0.5))
+    rays = view_rays(source, target, pixels, height=HEIGHT, width=WIDTH, unit=jnp.asarray(0.5))
     inside = np.asarray(rays.inside)
     assert inside.mean() > 0.2
     for time in (0.1, 0.5, 0.9):
@@ -44,7 +44,9 @@ def test_a_ray_is_the_line_that_its_pixel_sees(kind):
 
 def test_equal_cameras_rays_stay_on_their_pixels_without_rounding():
     pixels = jnp.asarray(np.random.default_rng(0).uniform(0, 1, (50, 2)) * [WIDTH, HEIGHT])
-    rays = view_rays(camera(), camera(), pixels, shape=(HEIGHT, WIDTH), unit=jnp.asarray(0.5))
+    rays = view_rays(
+        camera(), camera(), pixels, height=HEIGHT, width=WIDTH, unit=jnp.asarray(0.5)
+    )
     assert rays.inside.all()
     np.testing.assert_array_equal(rays.origin[:, :2], pixels)
     np.testing.assert_array_equal(rays.direction[:, :2], 0)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfx.reproject import _grid
+from jaxfx.reproject import _crossings
 
 
 HEIGHT, WIDTH = 6, 9
@@ -13,7 +13,9 @@ def test_a_ray_comes_in_where_small_steps_first_find_it_inside():
     rng = np.random.default_rng(0)
     origin = rng.uniform(-8, 16, (600, 3))
     direction = rng.normal(size=(600, 3))
-    found = _grid.entry(_grid.rays(*map(jnp.asarray, (origin, direction))), HEIGHT, WIDTH)
+    found = _crossings.entry_texel(
+        _crossings.grid_rays(*map(jnp.asarray, (origin, direction))), HEIGHT, WIDTH
+    )
     times = np.linspace(0, 60, 60_001)
     seen = 0
     for o, d, x, y, inside in zip(origin, direction, *map(np.asarray, found), strict=True):
@@ -31,19 +33,24 @@ def test_a_ray_comes_in_where_small_steps_first_find_it_inside():
 
 
 def test_of_two_moments_at_one_time_the_one_before_comes_first():
-    at = lambda time, after: _grid.Moment(jnp.asarray(time), jnp.asarray(after))
+    at = lambda time, after: _crossings.Moment(jnp.asarray(time), jnp.asarray(after))
     before, just_after = at(1.0, False), at(1.0, True)
-    assert _grid.earlier(before, just_after) and not _grid.earlier(just_after, before)
-    assert not _grid.earlier(before, before)
-    assert _grid.latest(before, just_after).after and not _grid.first(before, just_after).after
-    assert _grid.first(just_after, at(2.0, False)).after
-    assert not _grid.latest(just_after, at(2.0, False)).after
+    assert _crossings.is_earlier(before, just_after) and not _crossings.is_earlier(
+        just_after, before
+    )
+    assert not _crossings.is_earlier(before, before)
+    assert (
+        _crossings.later(before, just_after).after
+        and not _crossings.earlier(before, just_after).after
+    )
+    assert _crossings.earlier(just_after, at(2.0, False)).after
+    assert not _crossings.later(just_after, at(2.0, False)).after
 
 
 def test_a_ray_to_the_left_is_beyond_a_border_just_after_it():
-    moment = lambda after: _grid.Moment(jnp.asarray(1.0), jnp.asarray(after))
+    moment = lambda after: _crossings.Moment(jnp.asarray(1.0), jnp.asarray(after))
     cell = lambda after, d, backward: int(
-        _grid.cell_at(
+        _crossings.texel_at(
             moment(after), jnp.asarray(3.0 - d), jnp.asarray(d), jnp.asarray(backward)
         )
     )

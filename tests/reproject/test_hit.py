@@ -6,14 +6,16 @@ import pytest
 from jax.test_util import check_grads
 from scipy import ndimage
 
-from jaxfx.reproject._patch import patch
+from jaxfx.reproject._hit import edge_aware_patch
 
 
 def test_a_surface_without_a_step_is_read_as_scipy_reads_it():
     rng = np.random.default_rng(0)
     depth, image = -rng.uniform(0.4, 0.5, (7, 9)), rng.random((7, 9, 3))
     x, y = rng.uniform(-1, 10, 60), rng.uniform(-1, 8, 60)
-    found = patch(jnp.asarray(depth), *map(jnp.asarray, (x, y)), jnp.full(60, -0.45), None)
+    found = edge_aware_patch(
+        jnp.asarray(depth), *map(jnp.asarray, (x, y)), jnp.full(60, -0.45), None
+    )
     read = lambda plane: ndimage.map_coordinates(
         plane, [y - 0.5, x - 0.5], order=1, mode="nearest"
     )
@@ -27,7 +29,7 @@ def test_a_texel_of_another_surface_has_no_share():
     depth = jnp.array([[-1.0, -0.5], [-1.0, jnp.inf]])
     image = jnp.array([[10.0, 20.0], [30.0, jnp.nan]])[..., None]
     x, y = jnp.array([1.1, 1.1]), jnp.array([0.9, 0.9])
-    found = patch(depth, x, y, jnp.array([-1.0, -0.5]), 0.1)
+    found = edge_aware_patch(depth, x, y, jnp.array([-1.0, -0.5]), 0.1)
     np.testing.assert_allclose(found.read_colors(image)[:, 0], [10 * 0.6 + 30 * 0.4, 20])
 
 
@@ -39,6 +41,8 @@ def test_its_derivatives_are_difference_quotients():
 
     def colors(at, image):
         at, image = jnp.asarray(at), jnp.asarray(image)
-        return patch(jnp.asarray(depth), *at, jnp.full(8, -0.45), None).read_colors(image)
+        return edge_aware_patch(jnp.asarray(depth), *at, jnp.full(8, -0.45), None).read_colors(
+            image
+        )
 
     check_grads(colors, (at, image), order=1, modes=("fwd", "rev"), rtol=1e-6)

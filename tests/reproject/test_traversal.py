@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes.reproject import run
-from jaxfx.reproject._search import first_crossing
-from jaxfx.reproject._walk import level_of, pack, unpack
+from jaxfx.reproject._searches import first_crossing
+from jaxfx.reproject._traversal import level_of, pack, unpack
 from tests.cases.reproject import awkward_rays, field
 
 
@@ -49,9 +49,9 @@ def test_rays_from_their_end_meet_what_they_meet_from_their_start(method):
     runs_away = along[:, 2:] > 0
     origin = jnp.where(runs_away, begin + along, begin)
     expected = first_crossing(depth, begin, along, method, None)
-    found = first_crossing(depth, origin, along, method, None, from_end=True)
+    found = first_crossing(depth, origin, along, method, None, origin_at_end=True)
     np.testing.assert_array_equal(found.mask, expected.mask)
-    for name in ("x", "y", "side", "steps"):
+    for name in ("x", "y", "face", "steps"):
         both = (np.asarray(getattr(each, name))[expected.mask] for each in (found, expected))
         np.testing.assert_array_equal(*both, name)
     later = jnp.where(expected.mask, expected.time - runs_away[:, 0].astype(float), 0)
@@ -68,7 +68,7 @@ def test_a_ray_that_comes_in_at_an_edge_is_inside_whatever_rounding_says():
     along = end - edge.astype(np.float32)
     wall = jnp.full((96, 96), -1, jnp.float32)
     found = first_crossing(
-        wall, jnp.asarray(end), jnp.asarray(along), "pyramid", None, from_end=True
+        wall, jnp.asarray(end), jnp.asarray(along), "pyramid", None, origin_at_end=True
     )
     assert found.mask.all()
     assert (np.asarray(found.y) == np.floor(edge[:, 1])).mean() > 0.99

@@ -1,0 +1,247 @@
+"""From the texel that a search returned to a point of the surface, with its derivative.
+
+The surface is the column of the texel, or the bilinear patch through the four texel centres
+around the ray. At the hit, miss(t) = z(t) - S(x(t), y(t)) = 0, with S the height field. The
+implicit function theorem gives dt = -d(miss) / (d miss / dt): the time is constant in value,
+and its tangent comes from `miss`, computed from differentiable arguments at that time. No loop
+is differentiated.
+
+`height_field` is the inverse depth -1/z for `warp`, the depth for `intersect`: what is written
+here holds in both. Only `is_depth_step`, and with it a `threshold`, is for inverse depth alone.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxfx._numerics import safe_divide
+from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, not_before_start
+
+
+# Newton steps on a patch. With fewer, more hits stay on their texel; more cost time.
+_NEWTON_STEPS = 4
+# Texels. How far from the texel's hit the patch may be met. A patch lies within a texel of its
+# centre; larger values accept a hit on another sheet of the patch.
+_REACH_TEXELS = 1.5
+# Texels. The length of the last Newton step below which the iteration has converged. Larger
+# values accept points off the patch; below the rounding error no ray converges.
+_CONVERGED_TEXELS = 1e-2
+# A ratio of the slope of `miss` to the size of its terms. Below it a ray grazes the patch, and
+# the derivative, divided by the slope, would be mostly rounding error.
+_MIN_SLOPE = 1e-3
+
+
+class Patch(NamedTuple):
+    """An edge-aware bilinear stencil: four texels around each point, and their weights.
+
+    A weight is 0 where the texel lies on another surface. A weight that is 0 only because of
+    the position still has a derivative; its texel is skipped only where it is not finite.
+    """
+
+    rows: Int[Array, "4 ray"]
+    columns: Int[Array, "4 ray"]
+    weights: Float[Array, "4 ray"]
+
+    def read(self, values: Float[Array, "height width"]) -> Float[Array, " ray"]:
+        """The weighted mean of a map; 0 where all weights are 0."""
+        total = jnp.zeros_like(self.weights[0])
+        for row, column, weight in zip(self.rows, self.columns, self.weights, strict=True):
+            texel = values.at[row, column].get(mode="promise_in_bounds")
+            total = total + weight * _unless_unusable(texel, weight)
+        return safe_divide(total, jnp.sum(self.weights, axis=0))
+
+    def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
+        """The weighted mean of each channel: ray channel.
+
+        The loop keeps the stencil in memory. Fused, each channel would repeat the search.
+        """
+
+        def add(sums: tuple[Array, Array], texel: tuple[Array, Array, Array]) -> Any:
+            (total, weight_sum), (row, column, weight) = sums, texel
+            color = image.at[row, column].get(mode="promise_in_bounds")
+            weight_sum = weight_sum + weight
+            weight = jnp.broadcast_to(weight[:, None], color.shape)
+            return (total + weight * _unless_unusable(color, weight), weight_sum), None
+
+        weights = self.weights.astype(image.dtype)
+        total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
+        sums = total, jnp.zeros_like(weights[0])
+        (total, weight_sum), _ = jax.lax.scan(add, sums, (self.rows, self.columns, weights))
+        return safe_divide(total, jnp.broadcast_to(weight_sum[:, None], total.shape))
+
+
+def _unless_unusable(texel: Float[Array, "*shape"], weight: Float[Array, "*shape"]) -> Array:
+    """The texel, or 0 where it is not finite and has no weight."""
+    return jnp.where((weight > 0) | jnp.isfinite(texel), texel, 0)
+
+
+def edge_aware_patch(
+    height_field: Float[Array, "height width"],
+    x: Float[Array, " ray"],
+    y: Float[Array, " ray"],
+    anchor: Float[Array, " ray"],
+    threshold: int | float | None,
+) -> Patch:
+    """The stencil of the four texel centres around each (x, y), within one surface.
+
+    A texel belongs to the surface if no depth step by `threshold` is between it and `anchor`,
+    the value of the texel that was hit; `height_field` is then the inverse depth. Without a
+    `threshold` every finite texel belongs to it.
+    """
+    height, width = height_field.shape
+    corner_x, corner_y = (jax.lax.stop_gradient(jnp.floor(v - 0.5)) for v in (x, y))
+    fraction_x, fraction_y = x - 0.5 - corner_x, y - 0.5 - corner_y
+    rows, columns, weights = [], [], []
+    for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        column = jnp.clip(corner_x + i, 0, width - 1).astype(jnp.int32)
+        row = jnp.clip(corner_y + j, 0, height - 1).astype(jnp.int32)
+        value = height_field.at[row, column].get(mode="promise_in_bounds")
+        value = jax.lax.stop_gradient(value)
+        is_on_surface = value < jnp.inf
+        if threshold is not None:
+            is_on_surface = is_on_surface & ~is_depth_step(value, anchor, threshold)
+        weight_x = fraction_x if i else 1 - fraction_x
+        weight = weight_x * (fraction_y if j else 1 - fraction_y)
+        rows.append(row)
+        columns.append(column)
+        weights.append(jnp.where(is_on_surface, weight, 0))
+    return Patch(jnp.stack(rows), jnp.stack(columns), jnp.stack(weights))
+
+
+def is_depth_step(a: Array, b: Array, threshold: int | float) -> Array:
+    """Whether two inverse depths -1/z are of two surfaces: z differs by more than a ratio.
+
+    The ratio is to the nearer z: (z_far - z_near) / z_near > threshold.
+    """
+    nearer, farther = jnp.minimum(a, b), jnp.maximum(a, b)
+    return farther - nearer > -threshold * farther
+
+
+class SurfacePoint(NamedTuple):
+    """Where each ray meets the surface, differentiable.
+
+    - `position`: a point of the ray: x and y in texels, and the third coordinate.
+    - `grazing`: whether the ray meets the surface too obliquely for a derivative or a point of
+      its own. See `texel_point` and `patch_point`.
+    """
+
+    position: Float[Array, "ray 3"]
+    grazing: Bool[Array, " ray"]
+
+
+def texel_point(
+    height_field: Array, origin: Array, direction: Array, hit: TexelHit
+) -> SurfacePoint:
+    """The point where rays meet the top or a side of a texel's column.
+
+    A ray that runs along the top is grazing; its time is constant.
+    """
+    miss, slope = _texel_miss(height_field, origin, direction, hit)
+    grazing = (slope == 0) & hit.mask
+    return _implicit_point(
+        origin, direction, hit.time, miss, slope, hit.mask & ~grazing, grazing
+    )
+
+
+def _texel_miss(
+    height_field: Array, origin: Array, direction: Array, hit: TexelHit
+) -> tuple[Float[Array, " ray"], Float[Array, " ray"]]:
+    """The function that is 0 at the hit of a top or side, and its derivative along the ray.
+
+    For a side it lacks the constant border: only its tangent is used. For a ray that starts
+    inside the column it is 0: the time does not depend on anything.
+    """
+    x, y, z = jnp.moveaxis(origin + hit.time[:, None] * direction, -1, 0)
+    dx, dy, dz = jnp.moveaxis(jax.lax.stop_gradient(direction), -1, 0)
+    top = jnp.where(hit.mask, height_field[hit.y, hit.x], 0)
+    zeros = [jnp.zeros_like(x)] * 4
+    miss, slope = list(zeros), [jnp.ones_like(x)] * 4
+    miss[TOP], slope[TOP] = z - jnp.where(jnp.isfinite(top), top, 0), dz
+    miss[X_SIDE], slope[X_SIDE] = x, dx
+    miss[Y_SIDE], slope[Y_SIDE] = y, dy
+    return (
+        jnp.choose(hit.face, miss, mode="clip"),
+        jnp.choose(hit.face, slope, mode="clip"),
+    )
+
+
+def patch_point(
+    height_field: Array,
+    origin: Array,
+    direction: Array,
+    hit: TexelHit,
+    threshold: int | float | None,
+    *,
+    origin_at_end: bool = False,
+) -> SurfacePoint:
+    """The point where rays meet the patch through the texel centres, by Newton's method.
+
+    Where the iteration does not converge within `_REACH_TEXELS` of the texel's hit, or the ray
+    grazes the patch, the point and its derivative are those of the texel.
+    """
+    hold = jax.lax.stop_gradient
+    held_field, o, d = hold(height_field), hold(origin), hold(direction)
+    anchor = jnp.where(hit.mask, held_field[hit.y, hit.x], 0)
+
+    def patch_miss(height_field, origin, direction, time):
+        x, y, z = jnp.moveaxis(origin + time[:, None] * direction, -1, 0)
+        return z - edge_aware_patch(held_field, x, y, anchor, threshold).read(height_field)
+
+    value_and_slope = lambda time: jax.jvp(
+        lambda t: patch_miss(held_field, o, d, t), (time,), (jnp.ones_like(time),)
+    )
+    speed = jnp.maximum(jnp.abs(d[:, 0]), jnp.abs(d[:, 1]))  # texels per unit of time
+    reach = jnp.where(speed > 0, _REACH_TEXELS / jnp.where(speed > 0, speed, 1), jnp.inf)
+    low = not_before_start(hit.time - reach, d[:, 2], origin_at_end)
+    high = hit.time + reach
+
+    def newton(index, state):
+        time, last_move, _ = state
+        value, slope = value_and_slope(time)
+        move = -value / jnp.where(slope > 0, slope, 1)
+        moves = (slope > 0) & (index < _NEWTON_STEPS)
+        otherwise = jnp.where(index < _NEWTON_STEPS, jnp.inf, last_move)
+        last_move = jnp.where(moves, jnp.abs(move), otherwise)
+        return jnp.where(moves, jnp.clip(time + move, low, high), time), last_move, slope
+
+    # One iteration more, for the slope at the end: a loop's result is in memory, so that XLA
+    # does not compute it again in each consumer.
+    start = hit.time, jnp.full_like(hit.time, jnp.inf), jnp.ones_like(hit.time)
+    time, last_move, slope = jax.lax.fori_loop(0, _NEWTON_STEPS + 1, newton, start)
+    terms = jnp.abs(d[:, 2]) + jnp.abs(slope - d[:, 2])
+    is_steep = slope > _MIN_SLOPE * terms
+    is_on_patch = is_steep & (last_move * speed < _CONVERGED_TEXELS) & hit.mask
+    time = jnp.where(is_on_patch, time, hit.time)
+    texel_miss, texel_slope = _texel_miss(height_field, origin, direction, hit)
+    miss = patch_miss(height_field, origin, direction, time)
+    miss = jnp.where(is_on_patch, miss, texel_miss)
+    slope = jnp.where(is_on_patch, slope, texel_slope)
+    is_differentiable, grazing = hit.mask & (slope != 0), hit.mask & ~is_on_patch
+    return _implicit_point(origin, direction, time, miss, slope, is_differentiable, grazing)
+
+
+def _implicit_point(
+    origin, direction, time, miss, slope, is_differentiable, grazing
+) -> SurfacePoint:
+    """The position at a time that follows the root of `miss` where `is_differentiable`."""
+    miss = jnp.where(is_differentiable, miss, 0)
+    time = _implicit_root(time, miss, jnp.where(is_differentiable, slope, 1))
+    return SurfacePoint(origin + time[:, None] * direction, grazing)
+
+
+@jax.custom_jvp
+def _implicit_root(time: Array, miss: Array, slope: Array) -> Array:
+    """The root of `miss` along a ray. Its value is the given `time`.
+
+    The derivative is the implicit function theorem's: dt = -d(miss) / slope, with `slope` the
+    derivative of `miss` along the ray. The value of `miss` is never used.
+    """
+    return time
+
+
+@_implicit_root.defjvp
+def _implicit_root_jvp(primals, tangents):
+    time, _, slope = primals
+    return time, -tangents[1] / slope

@@ -1,0 +1,295 @@
+"""The exact search: a traversal of a minimum pyramid, many rays at a time.
+
+The state of a ray is one integer: the texel in which it is, and the level of the pyramid that
+it reads next. So one step of all rays is one fused loop with one result; the time of a ray
+follows from its texel.
+
+A step reads the cell of that level that holds the texel. If the ray reaches the cell's nearest
+value before it leaves the cell, the ray moves there and goes down in levels; at level 0 that
+is the hit. Otherwise it moves beyond the cell's border and may go up.
+
+Two programs step the rays. On a CPU the unfinished rays are packed together, in batches that
+fit the cache. On an accelerator a step costs a launch, however many rays are finished, so all
+rays step until the last one is done.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt32
+
+from jaxfx._platform import by_platform
+from jaxfx._pyramid import Pyramid, minimum_pyramid
+from jaxfx.reproject._crossings import (
+    START,
+    TOP,
+    X_SIDE,
+    Y_SIDE,
+    GridRays,
+    Moment,
+    TexelHit,
+    axis_entries,
+    backward_axes,
+    crossing_moment,
+    earlier,
+    entry_texel,
+    grid_rays,
+    is_earlier,
+    start_time,
+    texel_at,
+    texel_entry,
+)
+
+
+# Bits of a state for a column, and for a row. With 2 signs and 4 bits of level they fill 32.
+_TEXEL_BITS = 13
+# The largest height and width in texels: what 13 bits count. Checked for every argument.
+LARGEST_SIDE = 2**_TEXEL_BITS
+_TEXEL_MASK = LARGEST_SIDE - 1
+_LEVEL_SHIFT = 2 * _TEXEL_BITS + 2
+# Levels that mean that a ray is done. A pyramid has levels 0 to 13, of 4 bits.
+HIT, MISS = 15, 14
+# Rays. Up to this number rays are not packed: that would cost more than the steps saved.
+# Measured; a wrong value costs time only.
+_MIN_PACKED_RAYS = 4096
+# Rays per batch on a CPU. Above this the temporaries exceed 32 MB and are reallocated on every
+# call. A wrong value costs time only.
+_BATCH_RAYS = 2**18
+# Rays. Batch sizes are multiples of this, so that vector loops have no remainder: a loop of
+# odd length takes a fifth longer. A wrong value costs time only.
+_LANES = 64
+# A ratio. Unfinished rays are packed once they are at most 1 in 3: the steps computed are then
+# at most three times those needed. A wrong value costs time only.
+_PACKING_RATIO = 3
+# Steps between two checks of an accelerator's host whether any ray is unfinished. Each check
+# waits for the device; up to 5 steps are wasted at the end. A wrong value costs time only.
+_STEPS_PER_CHECK = 6
+# Levels. A ray goes down by two where it reaches a value, up by one where it leaves the cell two
+# levels above. Measured: a seventh fewer steps than with one. Any value gives the same hit.
+_LEVEL_STRIDE = 2
+# Cells. The first level is such that a ray crosses at most 4 of its cells between the nearest
+# and the farthest value. Measured. Any value gives the same hit.
+_START_CELLS = 4
+
+
+def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> UInt32[Array, "..."]:
+    """The state: column, row, level; 1 or 0 for a ray that runs to the left, and upwards."""
+    bits = level.astype(jnp.uint32)
+    for size, value in ((1, left), (1, up), (_TEXEL_BITS, y), (_TEXEL_BITS, x)):
+        bits = (bits << size) | value.astype(jnp.uint32)
+    return bits
+
+
+def unpack(state: UInt32[Array, "..."]) -> tuple[Array, Array, Array, Array, Array]:
+    """The arguments of `pack`, from its result."""
+    x = (state & _TEXEL_MASK).astype(jnp.int32)
+    y = ((state >> _TEXEL_BITS) & _TEXEL_MASK).astype(jnp.int32)
+    up, left = (
+        ((state >> bit) & 1).astype(jnp.int32) for bit in (2 * _TEXEL_BITS, 2 * _TEXEL_BITS + 1)
+    )
+    return x, y, level_of(state).astype(jnp.int32), left, up
+
+
+def level_of(state: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
+    """The level of a state."""
+    return state >> _LEVEL_SHIFT
+
+
+def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[Array, " ray"]:
+    """The states after each unfinished ray has read one cell."""
+    height, width = pyramid.shapes[0]
+    x, y, level, left, up = unpack(state)
+    read_level = jnp.minimum(level, len(pyramid.shapes) - 1)
+    columns = jnp.asarray([shape[1] for shape in pyramid.shapes], jnp.int32)[read_level]
+    offset = jnp.asarray(pyramid.offsets, jnp.int32)[read_level]
+    cell_x, cell_y = x >> read_level, y >> read_level
+    index = offset + cell_y * columns + cell_x
+    nearest = pyramid.values.at[index].get(mode="promise_in_bounds")
+
+    border_x, border_y = (cell_x + 1 - left) << read_level, (cell_y + 1 - up) << read_level
+    leave_x = crossing_moment(border_x, r.ox, r.ix, left)
+    leave_y = crossing_moment(border_y, r.oy, r.iy, up)
+    leave = earlier(leave_x, leave_y)
+    now = texel_entry(r, *axis_entries(r, x, y, left, up))
+    # Without motion in z the time is -inf or NaN where the ray is behind the value, else +inf.
+    reach_time = (nearest - r.oz) * r.iz
+    recedes = r.iz > 0
+    is_ahead = recedes & (now.time < reach_time)
+    meeting = Moment(jnp.where(is_ahead, reach_time, now.time), now.after & ~is_ahead)
+    is_behind_now = (now.time < reach_time) | ((now.time == reach_time) & ~now.after)
+    reached = jnp.where(recedes, is_earlier(meeting, leave), is_behind_now)
+    reached = reached & (nearest < jnp.inf)
+
+    # The next texel: where the ray reaches the value, or beyond the border of the cell.
+    go = Moment(jnp.where(reached, reach_time, leave.time), leave.after & ~reached)
+    x_then, y_then = texel_at(go, r.ox, r.dx, left), texel_at(go, r.oy, r.dy, up)
+    x_inside = _clip_to_cell(x_then, x, cell_x, read_level, left)
+    y_inside = _clip_to_cell(y_then, y, cell_y, read_level, up)
+    crosses_x, crosses_y = ~is_earlier(leave_y, leave_x), ~is_earlier(leave_x, leave_y)
+    next_x = jnp.where(~reached & crosses_x, border_x - left, x_inside)
+    next_y = jnp.where(~reached & crosses_y, border_y - up, y_inside)
+    stays = reached & ~is_ahead
+    next_x, next_y = jnp.where(stays, x, next_x), jnp.where(stays, y, next_y)
+    in_same_parent = ((next_x ^ x) | (next_y ^ y)) >> (level + _LEVEL_STRIDE) == 0
+    level_beyond = jnp.where(in_same_parent, level, level + 1)
+    next_level = jnp.where(reached, jnp.maximum(level - _LEVEL_STRIDE, 0), level_beyond)
+
+    is_hit = reached & (level == 0)
+    is_outside = (next_x < 0) | (next_x >= width) | (next_y < 0) | (next_y >= height)
+    is_miss = is_outside | (~reached & (leave.time == jnp.inf))
+    next_level = jnp.where(is_hit, HIT, jnp.where(is_miss, MISS, next_level))
+    is_done = is_hit | is_miss
+    next_x, next_y = jnp.where(is_done, x, next_x), jnp.where(is_done, y, next_y)
+    return jnp.where(level >= MISS, state, pack(next_x, next_y, next_level, left, up))
+
+
+def _clip_to_cell(
+    texel: Array, current: Array, cell: Array, level: Array, backward: Array
+) -> Array:
+    """A row or column, clipped to those of a cell that the ray has not yet passed."""
+    first, last = cell << level, ((cell + 1) << level) - 1
+    low = jnp.where(backward == 1, first, current)
+    high = jnp.where(backward == 1, current, last)
+    return jnp.clip(texel, low, high)
+
+
+def traverse(
+    height_field: Float[Array, "height width"],
+    origin: Float[Array, "ray 3"],
+    direction: Float[Array, "ray 3"],
+    max_steps: int | None,
+    origin_at_end: bool,
+) -> TexelHit:
+    """The first texel whose column each ray meets: exact, as if every texel were compared."""
+    pyramid = minimum_pyramid(height_field)
+    limit = np.iinfo(np.int32).max if max_steps is None else max_steps
+    is_finite = height_field < jnp.inf
+    nearest = jnp.min(jnp.where(is_finite, height_field, jnp.inf))
+    thickness = jnp.max(jnp.where(is_finite, height_field, -jnp.inf)) - nearest
+
+    def hits(rays, step_all):
+        origin, direction = rays
+        r = grid_rays(origin, direction, origin_at_end)
+        state, steps = _first_states(pyramid, thickness, r)
+        return _texel_hits(pyramid, r, *step_all(pyramid, r, state, steps, limit))
+
+    def in_batches(*rays):
+        count = len(origin)
+        batches = -(-count // _BATCH_RAYS)
+        if batches <= 1:
+            return hits(rays, _step_packed)
+        size = _whole_lanes(count / batches)
+        padding = ((0, batches * size - count), (0, 0))
+        split = tuple(jnp.pad(x, padding).reshape(batches, size, 3) for x in rays)
+        texel_hits = jax.lax.map(lambda batch: hits(batch, _step_packed), split)
+        return jax.tree.map(lambda x: x.reshape(-1)[:count], texel_hits)
+
+    all_at_once = lambda *rays: hits(rays, _step_all)
+    return by_platform(origin, direction, cpu=in_batches, accelerator=all_at_once)
+
+
+def _first_states(pyramid: Pyramid, thickness: Array, r: GridRays):
+    """States and step counts after the first step, which moves to the nearest value of all.
+
+    The level is then that whose cells fit the rest of the ray's length. Any level gives the
+    same hit; from the root it would take many more steps. `thickness` is the difference
+    between the farthest and the nearest value.
+    """
+    left, up = backward_axes(r)
+    x, y, inside = entry_texel(r, *pyramid.shapes[0])
+    x, y = (jnp.where(inside, texel, 0) for texel in (x, y))
+    root = jnp.full_like(x, len(pyramid.shapes) - 1)
+    state = step(pyramid, r, pack(x, y, jnp.where(inside, root, MISS), left, up))
+
+    x, y, level, left, up = unpack(state)
+    texels = thickness * r.iz * jnp.maximum(jnp.abs(r.dx), jnp.abs(r.dy))
+    fitting = jnp.ceil(jnp.log2(jnp.maximum(texels / _START_CELLS, 1)))
+    lowers = (level < MISS) & (r.iz > 0) & (fitting < level.astype(fitting.dtype))
+    level = jnp.where(lowers, jnp.where(lowers, fitting, 0).astype(level.dtype), level)
+    return pack(x, y, level, left, up), inside.astype(jnp.int32)
+
+
+def _texel_hits(pyramid: Pyramid, r: GridRays, state: Array, steps: Array) -> TexelHit:
+    """When, and through which face, rays meet the texels of their final states."""
+    x, y, level, left, up = unpack(state)
+    enter_x, enter_y = axis_entries(r, x, y, left, up)
+    entry_time = texel_entry(r, enter_x, enter_y).time
+    texel = pyramid.values.at[y * pyramid.shapes[0][1] + x].get(mode="promise_in_bounds")
+    reach_time = (texel - r.oz) * r.iz
+    on_top = (r.iz > 0) & (reach_time >= entry_time)
+    face = jnp.where(enter_x.time == entry_time, X_SIDE, Y_SIDE)
+    face = jnp.where(entry_time == start_time(r.dz, r.origin_at_end), START, face)
+    return TexelHit(
+        time=jnp.where(on_top, reach_time, entry_time),
+        x=x,
+        y=y,
+        face=jnp.where(on_top, TOP, face),
+        mask=level == HIT,
+        steps=steps,
+        exhausted=level < MISS,
+    )
+
+
+def _step_packed(pyramid, r, state, steps, max_steps):
+    """The final states and step counts on a CPU.
+
+    All rays step until two thirds of them are done. The others are then packed together and
+    go on, by this function again.
+    """
+    count = len(state)
+    packed_count = 0 if count <= _MIN_PACKED_RAYS else _whole_lanes(count / _PACKING_RATIO)
+
+    def goes_on(carry):
+        state, steps = carry
+        unfinished = jnp.sum(_is_unfinished(state, steps, max_steps), dtype=jnp.int32)
+        return unfinished > packed_count
+
+    def body(carry):
+        state, steps = carry
+        unfinished = _is_unfinished(state, steps, max_steps)
+        state = jnp.where(unfinished, step(pyramid, r, state), state)
+        return state, steps + unfinished.astype(jnp.int32)
+
+    state, steps = jax.lax.while_loop(goes_on, body, (state, steps))
+    if packed_count:
+        unfinished = _is_unfinished(state, steps, max_steps)
+        slot = jnp.where(unfinished, jnp.cumsum(unfinished, dtype=jnp.int32) - 1, packed_count)
+        ray = jnp.arange(count, dtype=jnp.int32)
+        packed = jnp.full(packed_count, count, jnp.int32).at[slot].set(ray, mode="drop")
+        take = lambda x: x.at[packed].get(mode="fill", fill_value=0)
+        rest = jnp.where(packed < count, take(state), jnp.uint32(MISS << _LEVEL_SHIFT))
+        rest = _step_packed(pyramid, jax.tree.map(take, r), rest, take(steps), max_steps)
+        state, steps = (
+            x.at[packed].set(final, mode="drop")
+            for x, final in zip((state, steps), rest, strict=True)
+        )
+    return state, steps
+
+
+def _step_all(pyramid, r, state, steps, max_steps):
+    """The final states and step counts on an accelerator: all rays step to the end."""
+
+    def goes_on(carry):
+        state, steps = carry
+        return jnp.any(_is_unfinished(state, steps, max_steps))
+
+    def body(carry):
+        state, steps = carry
+        for _ in range(_STEPS_PER_CHECK):
+            unfinished = _is_unfinished(state, steps, max_steps)
+            state = jnp.where(unfinished, step(pyramid, r, state), state)
+            steps = steps + unfinished.astype(jnp.int32)
+        return state, steps
+
+    return jax.lax.while_loop(goes_on, body, (state, steps))
+
+
+def _is_unfinished(state: Array, steps: Array, max_steps: int) -> Bool[Array, " ray"]:
+    return (level_of(state) < MISS) & (steps < max_steps)
+
+
+def _whole_lanes(rays: float) -> int:
+    """A number of rays, rounded up to a multiple of `_LANES`."""
+    return -(-math.ceil(rays) // _LANES) * _LANES
