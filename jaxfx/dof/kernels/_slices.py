@@ -135,7 +135,7 @@ class _End(NamedTuple):
 
 
 class Grid:
-    """Sheets divided into blocks, and the window of each block into which its spans are painted.
+    """Sheets divided into blocks, and the window into which a block's spans are painted.
 
     A window is the block with the margin that its sprites can reach. One more row below it
     takes writes that no one reads.
