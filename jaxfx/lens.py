@@ -1,4 +1,13 @@
-"""Lenses: from depth to the diameter of the circle of confusion, in pixels."""
+"""Lenses: from depth to the diameter of the circle of confusion, in pixels.
+
+| I want | call |
+|---|---|
+| a lens on a camera of the scene | `ThinLens.from_camera` |
+| a photographer's lens, focused by moving it | `ThinLens.from_physical` |
+| Blender's lens, or any whose sensor stays at the focal length | `ThinLens.from_sensor` |
+| blurriness between three planes, as an artist sets it | `FocusPlanes` |
+| a lens of my own | any object with the three members of `Lens` |
+"""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol, final, runtime_checkable
@@ -22,10 +31,10 @@ _Depths = Num[ArrayLike, "*shape"] | float | int | Sequence[Any]
 
 @runtime_checkable
 class Lens(Protocol):
-    """What every method of depth of field takes for a lens: three members, ours or your own.
+    """A lens as every method of depth of field takes it: any object with these three members.
 
     A lens of your own that is a pytree, an `equinox.Module` say, is differentiated, batched and
-    compiled as ours are. Any other object is asked once a call, outside the compiled program.
+    compiled as ours are. Any other object is asked once per call, outside the compiled program.
 
         class Clipped(eqx.Module):
             lens: jaxfx.ThinLens
@@ -94,7 +103,7 @@ def _measured(lens: Any, method: str, depth: Any, measure: Any) -> Array:
 
 @final
 class ThinLens(eqx.Module):
-    """A thin lens as an image can know it: three numbers.
+    """A thin lens, by the three numbers that an image can tell.
 
     A pixel at depth Z is spread over a disc of diameter `aperture * focal_pixels *
     |1 / focus_distance - 1 / Z|` pixels. The focal length and the display scale of the physical
@@ -111,6 +120,13 @@ class ThinLens(eqx.Module):
     is not positive. Traced values can't be looked at: there a bad lens makes every defocus NaN.
 
     **Gradient:** exact with respect to all three.
+
+    **Example:**
+
+    >>> from jaxfx import ThinLens
+    >>> lens = ThinLens(aperture=0.1, focus_distance=2.0, focal_pixels=100.0)
+    >>> print(lens.circle_of_confusion([2.0, 4.0]))
+    [0.  2.5]
 
     Source: Potmesil & Chakravarty 1981, the circle of confusion of a thin lens.
     """
@@ -147,6 +163,14 @@ class ThinLens(eqx.Module):
         **Raises:** `ValueError` for a camera that is no pinhole, or as `ThinLens`.
 
         **Gradient:** exact, in the camera's focal length too.
+
+        **Example:**
+
+        >>> from jaxfx import PinholeCamera, ThinLens
+        >>> camera = PinholeCamera.from_fov(1.0, height=8, width=8)
+        >>> lens = ThinLens.from_camera(camera, aperture=0.1, focus_distance=2.0)
+        >>> bool(lens.focal_pixels == camera.intrinsics[0, 0])
+        True
         """
         if not isinstance(camera, PinholeCamera):
             kind = type(camera).__name__
@@ -182,6 +206,15 @@ class ThinLens(eqx.Module):
         distance within the focal length.
 
         **Gradient:** exact.
+
+        **Example:** 50 mm at f/2, focused at 2 m, on a sensor of 100 pixels per mm.
+
+        >>> from jaxfx import ThinLens
+        >>> lens = ThinLens.from_physical(
+        ...     focal_length=50.0, f_number=2.0, focus_distance=2000.0, pixels_per_unit=100.0
+        ... )
+        >>> print(f"{lens.aperture:.1f} {lens.focal_pixels:.1f}")
+        25.0 5128.2
 
         Source: Potmesil & Chakravarty 1981, image distance and circle of confusion.
         """
@@ -239,6 +272,13 @@ class ThinLens(eqx.Module):
         **Raises:** `ValueError` for a number that is not positive.
 
         **Gradient:** exact.
+
+        **Example:** 50 mm at f/2, focused at 2 m, on a sensor 36 mm and 720 pixels wide.
+
+        >>> from jaxfx import ThinLens
+        >>> lens = ThinLens.from_sensor(0.050, 2.0, 2.0, 0.036, 720)
+        >>> print(f"{lens.aperture:.3f} {lens.focal_pixels:.0f}")
+        0.025 1000
 
         Source: Blender's Cycles, whose lens is `focal_length / (2 f_number)` in radius and
         whose rays through a pixel meet in the plane in focus.
@@ -312,6 +352,13 @@ class FocusPlanes(eqx.Module):
     values can't be looked at: there bad planes make every defocus NaN.
 
     **Gradient:** exact with respect to all four; a clamped depth has none.
+
+    **Example:**
+
+    >>> from jaxfx import FocusPlanes
+    >>> lens = FocusPlanes(near=1.0, focus=2.0, far=4.0, max_coc=8.0)
+    >>> print(lens.circle_of_confusion([2.0, 3.0, 9.0]))
+    [0. 4. 8.]
 
     Source: Scheuermann 2004, advanced depth of field.
     """

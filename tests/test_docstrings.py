@@ -19,6 +19,23 @@ EXAMPLES = {
 }
 
 
+def _is_made_or_called(name, value):
+    """A function, a class that users make or one of its constructors; no record, no method."""
+    if isinstance(value, property) or getattr(value, "_is_protocol", False):
+        return False
+    if inspect.isclass(value):
+        is_record = "**Arguments:**" not in (inspect.getdoc(value) or "")
+        return not is_record and not issubclass(value, Exception)
+    return name.count(".") == 1 or ".from_" in name or name.endswith(".look_at")
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, value in PUBLIC_OBJECTS.items() if _is_made_or_called(name, value)]
+)
+def test_it_has_an_example(name):
+    assert name in EXAMPLES
+
+
 @pytest.fixture(autouse=True)
 def as_users_have_it():
     """JAX's own defaults: float32, and promotion of types and ranks as JAX does it."""

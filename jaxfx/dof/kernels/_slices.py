@@ -230,7 +230,7 @@ class Grid:
         discs: Float[Array, "block disc plane"],
         dots: Float[Array, "block disc plane"] | None = None,
     ) -> Float[Array, "value height width"]:
-        """The sum of a slice's sprites in the frame; with `dots` also its derivative, appended."""
+        """The sum of a slice's sprites in the frame; with `dots`, then its derivative too."""
         v = self.values
         channels = v if dots is None else 2 * v
 
@@ -345,7 +345,7 @@ class Grid:
         return 0, block // across * tall, block % across * wide
 
     def _each_chunk(self, index, block, discs, visit, carry):
-        """Fold `visit(carry, block, discs, share, slope of share, column)` over a slice's discs.
+        """Fold `visit(carry, block, discs, share, its slope, column)` over a slice's discs.
 
         A disc that is painted tap by tap comes once per `column`; for others `column` is None.
         """
