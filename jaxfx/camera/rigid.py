@@ -76,7 +76,7 @@ def rigid_pose(name: str, value: Any) -> Float[Array, "4 4"]:
 
 
 def read_points(camera: Any, method: str, points: Any, size: int) -> Array:
-    """World points (`size` 3) or pixels (2) as a float array; `ValueError` for a wrong shape."""
+    """World points (`size` 3) or pixels (2), as floats; `ValueError` for a wrong shape."""
     name = f"{method}({'points' if size == 3 else 'pixels'})"
     check_fields(f"{type(camera).__name__}.{method}", camera)
     points = parameter(name, points, None)
