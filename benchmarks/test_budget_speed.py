@@ -57,7 +57,7 @@ def of_shadow():
     mesh = relight_scenes.view(SIZE)[0]
     light = DirectionalLight([0.4, -0.8, -0.6], [1, 1, 1])
     (at_light,) = shadow.light_cameras(
-        light, map_size=1024, center=(0.0, 1.0, -3.0), radius=6.0
+        light, map_size=1024, scene_center=(0.0, 1.0, -3.0), scene_radius=6.0
     )
     shadow_map = scene.depth(mesh, at_light, height=1024, width=1024)
     data = (

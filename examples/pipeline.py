@@ -232,7 +232,7 @@ class Mesh(NamedTuple):
         return floats(scene.gbuffer(self.mesh, camera, height=shape[0], width=shape[1]))
 
     def cast(self, light: DirectionalLight) -> Shadow:
-        side, ball = self.map_size, {"center": self.centre, "radius": self.radius}
+        side, ball = self.map_size, {"scene_center": self.centre, "scene_radius": self.radius}
         (camera,) = shadow.light_cameras(light, map_size=side, **ball)
         return floats((scene.depth(self.mesh, camera, height=side, width=side), camera))
 

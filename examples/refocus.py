@@ -129,13 +129,13 @@ def read_depth(arguments: argparse.Namespace) -> np.ndarray:
     is_depth = not arguments.disparity
     scale = arguments.depth_scale or (MILLI if is_depth and stored.dtype.kind in "iu" else 1.0)
     if is_depth:
-        depth = depths.clean(stored, scale=scale)
+        depth = depths.clean(stored, unit=scale)
     elif arguments.baseline and arguments.focal:
         depth = depths.from_stereo(
             stored * np.float32(scale),
             focal_pixels=arguments.focal,
             baseline=arguments.baseline,
-            offset=arguments.offset,
+            disparity_offset=arguments.offset,
         )
     elif arguments.disparity_scale and not arguments.baseline:
         depth = depths.from_disparity(
@@ -157,7 +157,7 @@ def read(arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
         scale = arguments.depth_scale or 1.0
         if arguments.disparity:
             raise ValueError("--disparity must have a file DEPTH of its own")
-        depth = np.asarray(depths.clean(depth, scale=scale))
+        depth = np.asarray(depths.clean(depth, unit=scale))
     else:
         image = io.read_color(arguments.color, layer=arguments.layer)
         depth = read_depth(arguments)
@@ -187,7 +187,7 @@ def read_behind(arguments: argparse.Namespace, shape: tuple[int, ...]) -> tuple 
         raise ValueError(
             f"--behind must have the first layer's size {shape}, got {depth.shape}"
         )
-    depth = np.asarray(depths.clean(depth, scale=arguments.depth_scale or 1.0))
+    depth = np.asarray(depths.clean(depth, unit=arguments.depth_scale or 1.0))
     # Where the second layer is missing there is nothing behind the first.
     return colors(image), np.where(np.isnan(depth), np.float32(np.inf), depth)
 

@@ -97,7 +97,9 @@ def set_stage(path: Path | None, size: int, map_size: int) -> Stage:
     points = np.asarray(camera.points(depth))[seen]
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - center, axis=-1).max())
-    (light_camera,) = shadow.light_cameras(key, map_size=map_size, center=center, radius=radius)
+    (light_camera,) = shadow.light_cameras(
+        key, map_size=map_size, scene_center=center, scene_radius=radius
+    )
     shadow_map = scene.depth(mesh, light_camera, height=map_size, width=map_size)
     receivers = shadow.receivers(gbuffer.depth, camera, light_camera, normal=gbuffer.normal)
 

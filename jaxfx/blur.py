@@ -254,8 +254,8 @@ def downsample(
     **Arguments:**
 
     - `image`: height width channel, any unit.
-    - `taps`: static; pixels read along an axis, even: 2 is the mean of 2 x 2 pixels, 4 has the
-      weights 1, 3, 3, 1, and so on down Pascal's triangle.
+    - `taps`: static; how many pixels are read along an axis, even: 2 is the mean of 2 x 2
+      pixels, 4 has the weights 1, 3, 3, 1, and so on down Pascal's triangle.
 
     **Returns:** height / 2, width / 2, rounded up, and channel, in the type of `image`. A pixel
     that is not finite spoils what its taps reach.

@@ -2,7 +2,7 @@
 
 | I have | call |
 |---|---|
-| depth in other units, or with a sky at some number | `clean(depth, scale=..., sky=...)` |
+| depth in other units, or with a sky at some number | `clean(depth, unit=..., sky=...)` |
 | inverse depth of a network, up to scale and shift | `from_disparity(disparity, scale=...)` |
 | the disparity of a stereo pair | `from_stereo(disparity, focal_pixels=..., baseline=...)` |
 | the distance along each pixel's ray | `from_ray_distance(distance, camera)` |
@@ -41,7 +41,7 @@ SKY = (1e10, 65504.0)
 def clean(
     depth: Num[ArrayLike, "height width"],
     *,
-    scale: Num[ArrayLike, ""] | float | int = 1.0,
+    unit: Num[ArrayLike, ""] | float | int = 1.0,
     sky: tuple[float | int, ...] | None = None,
 ) -> Float[Array, "height width"]:
     """Depth in scene units and in this module's convention, from numbers as a file stores them.
@@ -52,14 +52,14 @@ def clean(
 
     >>> import numpy as np
     >>> from jaxfx import depth
-    >>> depth.clean(np.array([[0, 6]], np.uint16), scale=1 / 4)  # steps of a quarter metre
+    >>> depth.clean(np.array([[0, 6]], np.uint16), unit=1 / 4)  # steps of a quarter metre
     Array([[nan, 1.5]], dtype=float32)
 
     **Arguments:**
 
     - `depth`: height width, floats or integers; 0, negative and NaN (and what a NumPy mask
       hides) are missing, inf is background.
-    - `scale`: scene units of one step of `depth`, positive.
+    - `unit`: scene units of one step of `depth`, positive.
     - `sky`: static; further numbers, in steps of `depth`, that stand for background, as does
       all beyond the largest of them. By default 1e10 and 65504, which renderers write, where
       `depth` holds floats; none where it holds integers.
@@ -67,15 +67,15 @@ def clean(
     **Returns:** height width: NaN where missing, inf for background, positive elsewhere. In the
     type of `depth`, at least float32; for integers JAX's default float type.
 
-    **Raises:** `ValueError` for a wrong shape or type, or a scale that is not positive.
+    **Raises:** `ValueError` for a wrong shape or type, or a unit that is not positive.
 
-    **Gradient:** exact in `depth` and `scale`; zero where the depth is missing or inf.
+    **Gradient:** exact in `depth` and `unit`; zero where the depth is missing or inf.
     """
-    scale = parameter("clean(scale=...)", scale)
-    check("clean(scale=...)", scale, lambda v: (v > 0) & np.isfinite(v), "positive and finite")
+    unit = parameter("clean(unit=...)", unit)
+    check("clean(unit=...)", unit, lambda v: (v > 0) & np.isfinite(v), "positive and finite")
     values, is_background = _numbers_and_sky("clean(depth)", depth, sky)
     is_known = (values > 0) & ~is_background
-    safe_depth = jnp.where(is_known, values, 1) * scale.astype(values.dtype)
+    safe_depth = jnp.where(is_known, values, 1) * unit.astype(values.dtype)
     return _with_holes(safe_depth, is_known, is_background)
 
 
@@ -128,12 +128,12 @@ def from_stereo(
     *,
     focal_pixels: Num[ArrayLike, ""] | float | int,
     baseline: Num[ArrayLike, ""] | float | int,
-    offset: Num[ArrayLike, ""] | float | int = 0.0,
+    disparity_offset: Num[ArrayLike, ""] | float | int = 0.0,
 ) -> Float[Array, "height width"]:
     """Depth from the disparity of a rectified pair of cameras.
 
-    `depth = focal_pixels * baseline / (disparity + offset)`. The depth is missing where no
-    match was found: where the disparity is 0, negative, NaN or inf.
+    `depth = focal_pixels * baseline / (disparity + disparity_offset)`. The depth is missing
+    where no match was found: where the disparity is 0, negative, NaN or inf.
 
     **Arguments:**
 
@@ -141,8 +141,8 @@ def from_stereo(
       count 16 steps per pixel, those of KITTI's files 256: divide first.)
     - `focal_pixels`: the focal length, in pixels.
     - `baseline`: the distance of the two cameras, scene units.
-    - `offset`: the x of the second camera's principal point less that of the first, in pixels;
-      the `doffs` of Middlebury's files.
+    - `disparity_offset`: the x of the second camera's principal point less that of the first,
+      in pixels; the `doffs` of Middlebury's files.
 
     **Returns:** height width, scene units, NaN where missing.
 
@@ -166,9 +166,11 @@ def from_stereo(
     base = parameter("from_stereo(baseline=...)", baseline)
     check("from_stereo(focal_pixels=...)", focal, lambda v: v > 0, "positive")
     check("from_stereo(baseline=...)", base, lambda v: v > 0, "positive")
-    offset = parameter("from_stereo(offset=...)", offset).astype(values.dtype)
+    disparity_offset = parameter("from_stereo(disparity_offset=...)", disparity_offset).astype(
+        values.dtype
+    )
     is_match = jnp.isfinite(values) & (values > 0)
-    shifted = jnp.where(is_match, values, 1) + offset
+    shifted = jnp.where(is_match, values, 1) + disparity_offset
     is_known = is_match & (shifted > 0)
     product = focal.astype(values.dtype) * base.astype(values.dtype)
     safe_depth = product / jnp.where(is_known, shifted, 1)

@@ -126,7 +126,13 @@ CALLS = {
     ),
     "shadow.light_cameras": (
         shadow.light_cameras,
-        {"light": LIGHT, "map_size": 8, "center": np.zeros(3), "radius": 2.0, "margin": 1},
+        {
+            "light": LIGHT,
+            "map_size": 8,
+            "scene_center": np.zeros(3),
+            "scene_radius": 2.0,
+            "margin": 1,
+        },
     ),
     "shadow.hard": (shadow.hard, SHADOWED),
     "shadow.prefiltered": (shadow.prefiltered, SHADOWED | {"size": 3}),
@@ -254,14 +260,14 @@ CALLS = {
         ft.partial(budget.accumulate, lambda eye: IMAGE),
         {"camera": CAMERA, "lens": LENS, "max_error": 0.1},
     ),
-    "depth.clean": (depth.clean, {"depth": DEPTH, "scale": 0.5}),
+    "depth.clean": (depth.clean, {"depth": DEPTH, "unit": 0.5}),
     "depth.from_disparity": (
         depth.from_disparity,
         {"disparity": DEPTH, "scale": 0.5, "shift": 0.1},
     ),
     "depth.from_stereo": (
         depth.from_stereo,
-        {"disparity": DEPTH, "focal_pixels": 50.0, "baseline": 0.1, "offset": 0.0},
+        {"disparity": DEPTH, "focal_pixels": 50.0, "baseline": 0.1, "disparity_offset": 0.0},
     ),
     "depth.from_ray_distance": (
         depth.from_ray_distance,

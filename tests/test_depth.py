@@ -64,7 +64,7 @@ def test_what_renderers_write_for_a_sky(dtype):
 def test_other_marks_of_a_sky():
     values = np.array([[1e10, 65504.0, 1000.0, 999.0]])
     np.testing.assert_array_equal(depth.clean(values, sky=()), values)
-    found = depth.clean(values, sky=(1000.0,), scale=2)
+    found = depth.clean(values, sky=(1000.0,), unit=2)
     np.testing.assert_array_equal(found, [[INF, INF, INF, 1998]])
 
 
@@ -72,13 +72,13 @@ def test_other_marks_of_a_sky():
 def test_millimetres(dtype):
     """Of integers no number is a sky, but the one that the caller names."""
     steps = np.array([[0, 1, 250]]).astype(dtype)
-    np.testing.assert_allclose(depth.clean(steps, scale=1 / 1000), [[NAN, 0.001, 0.25]])
+    np.testing.assert_allclose(depth.clean(steps, unit=1 / 1000), [[NAN, 0.001, 0.25]])
     np.testing.assert_array_equal(depth.clean(steps, sky=(250,)), [[NAN, 1, INF]])
 
 
 def test_the_largest_integer_is_a_depth():
     steps = np.array([[65504, 65535]], np.uint16)
-    np.testing.assert_allclose(depth.clean(steps, scale=1 / 5000), steps / 5000)
+    np.testing.assert_allclose(depth.clean(steps, unit=1 / 5000), steps / 5000)
 
 
 def test_layouts_that_come_from_outside():
@@ -114,7 +114,7 @@ def test_disparity_of_a_pair():
         left - right + 40 * doffs,
         focal_pixels=focal,
         baseline=baseline,
-        offset=doffs - 40 * doffs,
+        disparity_offset=doffs - 40 * doffs,
     )
     np.testing.assert_allclose(found, z, rtol=1e-12)
 
@@ -123,9 +123,11 @@ def test_no_match_is_missing():
     """0 of KITTI, -1 of OpenCV, inf of Middlebury; not infinitely far, whatever the offset."""
     disparity = np.array([[0.0, -1.0, INF, NAN, 4.0]])
     for offset in (0.0, 2.0):
-        found = depth.from_stereo(disparity, focal_pixels=10, baseline=0.5, offset=offset)
+        found = depth.from_stereo(
+            disparity, focal_pixels=10, baseline=0.5, disparity_offset=offset
+        )
         np.testing.assert_allclose(found, [[NAN] * 4 + [5 / (4 + offset)]])
-    beyond = depth.from_stereo(disparity, focal_pixels=10, baseline=0.5, offset=-5.0)
+    beyond = depth.from_stereo(disparity, focal_pixels=10, baseline=0.5, disparity_offset=-5.0)
     assert np.isnan(beyond).all()
 
 
@@ -157,7 +159,7 @@ HOLED = np.array([[1.3, 0.0, NAN], [INF, -2.0, 0.7]])
 
 
 def test_slopes_of_clean():
-    slopes(lambda d, s: depth.clean(d, scale=s), HOLED, np.array(1.5))
+    slopes(lambda d, s: depth.clean(d, unit=s), HOLED, np.array(1.5))
 
 
 def test_slopes_of_disparity():
@@ -171,7 +173,7 @@ def test_slopes_of_disparity():
 
 def test_slopes_of_a_pair():
     slopes(
-        lambda d, f, b, o: depth.from_stereo(d, focal_pixels=f, baseline=b, offset=o),
+        lambda d, f, b, o: depth.from_stereo(d, focal_pixels=f, baseline=b, disparity_offset=o),
         HOLED,
         np.array(20.0),
         np.array(0.3),
@@ -334,10 +336,10 @@ GOOD = np.ones((2, 3))
         (lambda: depth.clean(None), r"`clean\(depth\)` must be an array, got None"),
         (lambda: depth.clean(GOOD > 0), r"must hold real numbers, got bool"),
         (
-            lambda: depth.clean(GOOD, scale=0),
-            r"`clean\(scale=...\)` must be positive and finite",
+            lambda: depth.clean(GOOD, unit=0),
+            r"`clean\(unit=...\)` must be positive and finite",
         ),
-        (lambda: depth.clean(GOOD, scale=INF), r"`clean\(scale=...\)` must be positive"),
+        (lambda: depth.clean(GOOD, unit=INF), r"`clean\(unit=...\)` must be positive"),
         (
             lambda: depth.from_disparity(GOOD, scale=GOOD),
             r"`from_disparity\(scale=...\)` must have shape \(\)",

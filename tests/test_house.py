@@ -88,6 +88,19 @@ def test_imports_point_down(path):
     assert set(_imports(TREES[path])) <= MAY_IMPORT[_part(path)]
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_package_takes_what_another_keeps_to_itself(path):
+    """A module or name with an underscore belongs to the package that it is in."""
+    own = ("jaxfx", _part(path))
+    for node in ast.walk(TREES[path]):
+        if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("jaxfx."):
+            continue
+        package = tuple(node.module.split(".")[:2])
+        names = [*node.module.split(".")[2:], *(alias.name for alias in node.names)]
+        private = [name for name in names if name.startswith("_")]
+        assert package == own or not private, f"{node.module}: {private}"
+
+
 def test_host_side_is_loaded_when_it_is_asked_for():
     loaded = f"{LAZY_LIBRARIES!r} & sys.modules.keys() or None"
     done = subprocess.run(

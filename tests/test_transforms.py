@@ -183,7 +183,9 @@ EXAMPLES = {
     "shift": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "focal_pixels": [lambda rng, size: np.array(rng.uniform(20, 30))],
     "baseline": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
-    "offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "disparity_offset": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
+    "unit": [lambda rng, size: np.array(rng.uniform(1, 2))],
+    "ramp": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "softness": [lambda rng, size: np.array(rng.uniform(1, 2))],
 }
 

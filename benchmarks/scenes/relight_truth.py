@@ -35,7 +35,7 @@ def lambert(mesh, camera, size):
 
 def shadow_of(mesh, gbuffer, camera, light, map_size=1024):
     """The light's visibility by unfiltered shadow maps."""
-    ball = {"center": mesh.center, "radius": mesh.radius}
+    ball = {"scene_center": mesh.center, "scene_radius": mesh.radius}
     cameras = shadow.light_cameras(light, map_size=map_size, **ball)
     take = functools.partial(scene.depth, mesh, height=map_size, width=map_size)
     maps = [take(light_camera, backend="embree") for light_camera in cameras]

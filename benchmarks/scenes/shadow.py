@@ -127,7 +127,9 @@ class Still:
         centre = (ends.min(axis=0) + ends.max(axis=0)) / 2
         radius = np.linalg.norm(ends - centre, axis=-1).max()
         light = DirectionalLight(self.sun, WHITE)
-        cameras = shadow.light_cameras(light, map_size=map_size, center=centre, radius=radius)
+        cameras = shadow.light_cameras(
+            light, map_size=map_size, scene_center=centre, scene_radius=radius
+        )
         return self.compared(cameras, map_size)
 
     def under_a_square_lamp(self, map_size, light_size):

@@ -116,7 +116,7 @@ def shadow(
 
     - `shadow_map`, `receivers`: height width, as in `shadow.pcf`.
     - `size`: static; odd, in texels, of the full filter.
-    - `bias`, `slope_bias`: scene units and texels, as in `shadow.pcf`.
+    - `bias`, `slope_bias`: as in `shadow.pcf`.
     - `max_error`: root mean square of the visibility, a ratio, over all pixels.
 
     **Returns:** a `Plan`, to be called with `shadow_map, receivers`.

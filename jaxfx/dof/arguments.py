@@ -1,8 +1,9 @@
-"""What the methods ask of their arguments, and the picture that they compute with.
+"""Checks of the arguments that all methods share, and the arrays that they compute with.
 
-A pixel whose depth is missing (0, negative or NaN) has no circle of confusion. It has no
-share in other pixels. It shows what reaches it; where nothing does, or where a method asks for
-the pixel's own circle, it keeps its own colour.
+A pixel whose depth is missing (0, negative or NaN) has no circle of confusion and adds nothing
+to other pixels. It shows the sprites that reach it. Where none does, or where a method needs
+the pixel's own circle of confusion, it keeps its own colour. `fit` and `budget` use this
+module.
 """
 
 import math
@@ -19,7 +20,8 @@ from jaxfx._numerics import working_dtype
 from jaxfx.lens import FocusPlanes, Lens, ThinLens
 
 
-# What its own colour weighs in a pixel without a circle, beside 1 for neighbours all about it.
+# Weight of a missing pixel's own colour, beside 1 for sprites that cover it. Larger, and filled
+# holes keep their colour; 0, and a pixel that no sprite reaches is 0 / 0.
 OWN = 1e-3
 
 
@@ -38,7 +40,7 @@ def check_arguments(
 
 
 class Sampled(eqx.Module):
-    """What a lens that is not ours makes of one depth image, whatever depth is asked for."""
+    """The circles of confusion of one depth image, by a lens of a class that is not ours."""
 
     focus_distance: Float[Array, ""]
     signed: Float[Array, "height width"]
@@ -54,18 +56,18 @@ class Sampled(eqx.Module):
 
 
 def compiled(function: str, lens: Any, depth: Float[Array, "height width"]) -> Any:
-    """The lens if it is ours; else what it says of this depth, since it may be any object."""
+    """The lens, if it is ours; else its circles of confusion at this depth as a pytree."""
     if isinstance(lens, ThinLens | FocusPlanes | Sampled):
         return lens
     dtype = working_dtype(depth.dtype)
     focus = as_array(f"{function}(lens.focus_distance)", lens.focus_distance).astype(dtype)
     depth = jnp.where(depth > 0, depth.astype(dtype), focus)
-    found = []
+    circles = []
     for method in ("defocus", "circle_of_confusion"):
         name = f"{function}(lens.{method})"
-        found.append(as_array(name, getattr(lens, method)(depth)).astype(dtype))
-        check_shape(name, found[-1], depth.shape)
-    return Sampled(focus, *found)
+        circles.append(as_array(name, getattr(lens, method)(depth)).astype(dtype))
+        check_shape(name, circles[-1], depth.shape)
+    return Sampled(focus, *circles)
 
 
 def largest_coc(function: str, depth: Float[Array, "height width"], lens: Lens) -> float:
@@ -89,7 +91,7 @@ def largest_coc(function: str, depth: Float[Array, "height width"], lens: Lens) 
 
 
 def largest_of(function: str, depth: Float[Array, "height width"], lens: Lens) -> float | None:
-    """The largest circle that is a number, inside of another trace as well; None if traced."""
+    """The largest circle of confusion that is not NaN, in pixels; None if it is traced."""
     if not is_concrete(depth, lens):
         return None
     with jax.ensure_compile_time_eval():
@@ -101,12 +103,12 @@ def largest_of(function: str, depth: Float[Array, "height width"], lens: Lens) -
 
 
 class Pixels(NamedTuple):
-    """Pixels in one working type, and which of them are no pixels.
+    """An image and its depth in one working type, with masks of the pixels that lack something.
 
-    - `image`: zero where a colour is not finite.
+    - `image`: 0 where the colour is not finite.
     - `depth`: that of the focus plane where it is missing.
-    - `missing`: the pixels without a depth. `lost`: those of them without a colour as well.
-    - `bad`: all others without a colour; and all where the lens is no lens.
+    - `missing`: the depth is missing. `lost`: the colour is not finite either.
+    - `bad`: the depth is known and the colour is not finite, or the circle of confusion is NaN.
     """
 
     image: Float[Array, "height width channel"]
@@ -119,7 +121,7 @@ class Pixels(NamedTuple):
 def pixels(
     image: Float[Array, "height width channel"], depth: Float[Array, "height width"], lens: Lens
 ) -> Pixels:
-    """The picture that a method computes with, in float32 at least."""
+    """The image and depth that a method computes with, in float32 at least."""
     image = image.astype(working_dtype(image.dtype))
     depth = depth.astype(image.dtype)
     missing = ~(depth > 0)
@@ -132,10 +134,10 @@ def pixels(
 
 
 class Defocused(NamedTuple):
-    """A picture and how far each of its pixels is out of focus, in one working type.
+    """An image and the defocus of each pixel, in one working type; masks as in `Pixels`.
 
-    `defocus` is signed, in pixels, and clamped to the largest circle of confusion. It is zero
-    where it is not known, as `missing` and `bad` of `Pixels` say.
+    `defocus` is in pixels, clamped to the largest circle of confusion, and 0 where it is not
+    known.
     """
 
     image: Float[Array, "height width channel"]
@@ -151,13 +153,13 @@ def defocused(
     lens: Lens,
     max_coc: float,
 ) -> Defocused:
-    """The picture that a method computes with."""
+    """The image and defocus that a method computes with."""
     image, depth, missing, lost, bad = pixels(image, depth, lens)
     defocus = lens.defocus(depth)
     # Not by a clip: where a defocus is infinite, its derivative must be 0.
     inside = (defocus > -max_coc) & (defocus < max_coc)
     defocus = jnp.where(inside, defocus, jnp.where(defocus < 0, -max_coc, max_coc))
-    # A lens that is no lens makes every pixel bad.
+    # A lens with a NaN in it makes every pixel bad.
     defocus = jnp.where(missing | jnp.isnan(lens.defocus(depth)), 0, defocus)
     return Defocused(image, defocus, missing, lost, bad)
 
@@ -167,6 +169,6 @@ def with_own(
     image: Float[Array, "height width channel"],
     missing: Bool[Array, "height width"],
 ) -> Float[Array, "height width value"]:
-    """Sums of colours and, last, of weights, with a little of their own to missing pixels."""
+    """Sums of colours and of weights; missing pixels get their own colour, weighted `OWN`."""
     own = OWN * jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
     return sums + jnp.where(missing[..., None], own, 0)

@@ -19,10 +19,14 @@ from jaxfx.dof.sprites import POINT_RADIUS
 from jaxfx.lens import Lens
 
 
+# Least difference in defocus between an occluder and a hidden point, in pixels: their quotient
+# with the distance stays finite.
 _SMALLEST_GAP = 1e-3
-# Square of a slope, in pixels of defocus a pixel, that is as good as none.
+# Square of a slope, in pixels of defocus per pixel, below which both neighbours count alike.
+# With 0 the weights of two equal slopes are 0 / 0; larger, and edges blur the slope.
 _LEVEL = 1e-2
-# A hidden point that this share of the lens sees counts in full.
+# Share of the lens, 0 to 1, from which on a hidden point that it sees counts in full. With 1,
+# points that part of the lens sees would count too little and the fallback colour too much.
 _SEEN = 0.25
 
 
@@ -143,20 +147,20 @@ def _layered(image, depth, lens, extent, behind, threshold):
     spoils = spoiled(view.bad, jnp.abs(view.defocus), max_coc) | view.lost
     if behind is not None:
         second = defocused(behind[0], behind[1], behind[2], max_coc)
-        # Behind what is not known it is not known what is seen.
-        there = jnp.isfinite(behind[1]) & ~(second.bad | second.missing | view.missing)
-        farther = jnp.where(there, second.defocus, view.defocus)
-        # Nor does what is not known hide anything: it lies behind all.
+        # Behind a missing pixel the second layer is not known to be seen.
+        is_second = jnp.isfinite(behind[1]) & ~(second.bad | second.missing | view.missing)
+        farther = jnp.where(is_second, second.defocus, view.defocus)
+        # A missing pixel hides nothing: it counts as the farthest.
         seen = _seen(jnp.where(view.missing, max_coc, view.defocus), farther, max_coc)
-        # What lies within a slice behind a surface is that surface, folded.
+        # A point less than one slice behind a surface belongs to that surface.
         apart = clip01((farther - view.defocus) / threshold - 1)
-        through = jnp.where(there, clip01(seen / _SEEN) * apart, 0)
+        through = jnp.where(is_second, clip01(seen / _SEEN) * apart, 0)
         layers.append(_sheet(second.image, farther, through, view.missing, threshold))
         spoils |= spoiled(second.bad, jnp.abs(second.defocus), max_coc)
     far = extent.reach
-    # Beyond the frame all goes on as it ends there.
+    # Beyond the frame the last pixels are repeated.
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
-    sheets = jax.tree.map(lambda *x: jnp.stack([pad(each) for each in x]), *layers)
+    sheets = jax.tree.map(lambda *planes: jnp.stack([pad(x) for x in planes]), *layers)
     light, late = jnp.split(jnp.moveaxis(composited(extent, sheets), 0, -1), 2, axis=-1)
     late = with_own(late, view.image, view.missing)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
@@ -170,7 +174,7 @@ def _sheet(
     missing: Bool[Array, "height width"],
     threshold: Float[Array, ""],
 ) -> Sheets:
-    """The sprites of a layer."""
+    """The sprites of one layer, as `Sheets` without the axis of sheets."""
     half = jnp.abs(defocus) / 2
     radius = jnp.where(half < POINT_RADIUS, POINT_RADIUS, half)
     signed = jnp.where(defocus < 0, -2, 2) * radius
@@ -187,11 +191,11 @@ def _sheet(
 def _slope(
     x: Float[Array, "height width"], missing: Bool[Array, "height width"], axis: int
 ) -> Float[Array, "height width"]:
-    """How much a surface's defocus changes a pixel, an edge of it left aside.
+    """Slope of the defocus along an axis, in pixels per pixel, that ignores edges in depth.
 
-    Of the differences to the neighbours on both sides, each weighted by the other's square: the
-    smaller counts where they differ much, and there is no kink where they are alike. A
-    neighbour that is missing stands back for the other.
+    The mean of the differences to both neighbours, each weighted by the square of the other
+    one: the smaller counts where they differ much, and there is no kink where they are equal.
+    A neighbour that is missing does not count.
     """
     if x.shape[axis] == 1:
         return jnp.zeros_like(x)
@@ -222,28 +226,29 @@ def _seen(
     farther: Float[Array, "height width"],
     max_coc: float,
 ) -> Float[Array, "height width"]:
-    """The share of the lens that sees a hidden point, its defocus and the first layer's given.
+    """The share of the lens, per pixel, that sees a point of the second layer.
 
-    From the point's own pixel the first layer is followed while it lies in front of the point.
-    A pixel of it that lies so many pixels away and so much in front hides the point from the
-    place on the lens, in its radii, that is the quotient of the two. Where it has come much
-    nearer to the point's defocus than where it started, it has ended.
+    `farther` is the point's defocus, `defocus` that of the first layer. In 8 directions the
+    first layer is followed from the point's own pixel while it lies in front of the point. A
+    pixel of it at some distance, and with some difference in defocus, hides the point from the
+    place on the lens that is the quotient of the two, in radii of the lens. The first layer
+    ends where its defocus comes much nearer to the point's than it was at the start.
     """
     height, width = defocus.shape
     steps = int(max_coc) + 1
     padded = jnp.pad(defocus, steps, mode="edge")
-    ways = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
+    directions = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
 
     @jax.checkpoint
-    def visible(way):
-        length = jnp.sqrt(jnp.sum(way * way).astype(defocus.dtype))
+    def visible(direction):
+        length = jnp.sqrt(jnp.sum(direction * direction).astype(defocus.dtype))
 
         def ahead(gap):
             return jnp.maximum(gap, _SMALLEST_GAP) / 2
 
         def step(carry, count):
             covered, hidden = carry
-            start = steps + count * way
+            start = steps + count * direction
             gap = farther - jax.lax.dynamic_slice(padded, start, (height, width))
             covered = covered * clip01(gap / ahead(farther - defocus))
             return (covered, hidden + length * covered / ahead(gap)), None
@@ -253,4 +258,4 @@ def _seen(
         hidden = jax.lax.scan(jax.checkpoint(step), start, jnp.arange(1, steps))[0][1]
         return 1 - clip01(hidden) ** 2
 
-    return jnp.mean(jax.lax.map(visible, jnp.asarray(ways)), axis=0)
+    return jnp.mean(jax.lax.map(visible, jnp.asarray(directions)), axis=0)

@@ -1,4 +1,4 @@
-"""Pixels that a colour which is no number spoils: all that its sprite reaches."""
+"""Pixels that are spoilt by a colour that is not finite: those that its sprite reaches."""
 
 import functools as ft
 
@@ -14,9 +14,10 @@ from jaxfx.dof.sprites import POINT_RADIUS, reach, row_half_width
 def spoiled(
     bad: Bool[Array, "height width"], coc: Float[Array, "height width"], max_coc: int | float
 ) -> Bool[Array, "height width"]:
-    """Where the sprites of the `bad` pixels reach, `max_coc` where a circle is not known.
+    """The pixels that sprites of the `bad` pixels reach.
 
-    If there are none, nothing is computed; in a batch, for no image that has none.
+    A circle of confusion that is NaN or too large counts as `max_coc`. If no pixel is bad,
+    nothing is computed; in a batch, nothing for images that have none.
     """
     diameter = jnp.where(coc < max_coc, jnp.maximum(coc, 2 * POINT_RADIUS), max_coc)
     # The other pixels reach only themselves: the kernels then skip them.
@@ -24,8 +25,8 @@ def spoiled(
 
     # Not by a `cond` alone, which under `vmap` becomes a `select`, and computes both sides.
     is_good = lambda bad, _: ~bad.any()
-    found = ft.partial(_reached, reach(max_coc))
-    return either(is_good, lambda bad, _: bad, found, bad, radius)
+    cover = ft.partial(_reached, reach(max_coc))
+    return either(is_good, lambda bad, _: bad, cover, bad, radius)
 
 
 def _reached(
@@ -39,16 +40,17 @@ def _reached(
 def _summed(
     far: int, bad: Bool[Array, "height width"], radius: Float[Array, "height width"]
 ) -> Bool[Array, "height width"]:
-    """Where the sum of their sprites is not 0."""
+    """The pixels at which the sum of the bad sprites is not 0."""
     return sum_all(bad[..., None].astype(radius.dtype), radius, far)[..., 0] > 0
 
 
 def _grown(
     far: int, bad: Bool[Array, "height width"], radius: Float[Array, "height width"]
 ) -> Bool[Array, "height width"]:
-    """The same in few launches: every row of every sprite at once, by doubling steps aside.
+    """The same in few launches: all rows of all sprites at once, by doubling steps sideways.
 
-    `beyond` is how many columns beyond its pixel a row goes on, -1 where there is none of it.
+    `beyond` is, per row of a sprite, how many columns it extends beyond its pixel to either
+    side, or -1 where the sprite has no such row.
     """
     height, width = bad.shape
     rows = jnp.arange(far + 1).astype(radius.dtype)  # a sprite is its own mirror image
@@ -61,5 +63,5 @@ def _grown(
         beyond, step = jnp.maximum(beyond, beside - step), 2 * step
     tall = jnp.pad(beyond, ((0, 0), (far, far), (0, 0)), constant_values=-1)
     offsets = [(abs(row), row + far) for row in range(-far, far + 1)]
-    found = [tall[row, start : start + height] for row, start in offsets]
-    return ft.reduce(jnp.maximum, found) >= 0
+    shifted = [tall[row, start : start + height] for row, start in offsets]
+    return ft.reduce(jnp.maximum, shifted) >= 0

@@ -50,7 +50,7 @@ def read_depth(path: StrPath, *, layer: str | None = None) -> Num[np.ndarray, "h
     >>> from jaxfx import depth, io
     >>> np.save("millimetres.npy", np.full((6, 8), 2500, np.uint16))
     >>> millimetres = io.read_depth("millimetres.npy")
-    >>> print(depth.clean(millimetres, scale=1e-3)[0, 0])
+    >>> print(depth.clean(millimetres, unit=1e-3)[0, 0])
     2.5
     """
     data = Path(path).read_bytes()

@@ -29,8 +29,8 @@ def light_cameras(
     light: Light,
     *,
     map_size: WholeNumber,
-    center: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
-    radius: Float[ArrayLike, ""] | float = 1.0,
+    scene_center: Float[ArrayLike, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scene_radius: Float[ArrayLike, ""] | float = 1.0,
     margin: WholeNumber = 0,
 ) -> tuple[PinholeCamera | OrthographicCamera, ...]:
     """The cameras to render a light's shadow maps with.
@@ -43,18 +43,18 @@ def light_cameras(
 
     - `light`: any of the four.
     - `map_size`: static; side of a map, in pixels.
-    - `center`, `radius`: the ball that holds the scene, 3 and a scalar, in scene units; a
-      directional light's camera is placed two radii before the centre.
+    - `scene_center`, `scene_radius`: the ball that holds the scene, 3 and a scalar, in scene
+      units; a directional light's camera is placed two radii before the centre.
     - `margin`: static; pixels by which each map extends beyond the ball, the cone or the
       cube's face on each side. Half a filter's size keeps filters inside a face.
 
     **Returns:** a tuple of cameras.
 
-    **Raises:** `ValueError` for a radius that is not positive, a margin that fills the map, or
-    a spot light's cone of pi or more.
+    **Raises:** `ValueError` for a `scene_radius` that is not positive, a margin that fills the
+    map, or a spot light's cone of pi or more.
 
-    **Gradient:** exact with respect to the light, `center` and `radius`; zero along the light's
-    own roll, which is arbitrary, and at a direction of zero.
+    **Gradient:** exact with respect to the light, `scene_center` and `scene_radius`; zero along
+    the light's own roll, which is arbitrary, and at a direction of zero.
 
     **Example:** the six maps of a point light are used side by side; here those of an empty
     scene:
@@ -80,18 +80,23 @@ def light_cameras(
         lambda n: 0 <= 2 * n < map_size,
         f"0 or more and below half of `map_size`, which is {map_size}",
     )
-    center = parameter("light_cameras(center=...)", center, (3,))
-    radius = parameter("light_cameras(radius=...)", radius)
-    check("light_cameras(center=...)", center, np.isfinite, "finite")
-    check("light_cameras(radius=...)", radius, lambda v: (v > 0) & (v < np.inf), "positive")
+    scene_center = parameter("light_cameras(scene_center=...)", scene_center, (3,))
+    scene_radius = parameter("light_cameras(scene_radius=...)", scene_radius)
+    check("light_cameras(scene_center=...)", scene_center, np.isfinite, "finite")
+    check(
+        "light_cameras(scene_radius=...)",
+        scene_radius,
+        lambda v: (v > 0) & (v < np.inf),
+        "positive",
+    )
     inner = map_size - 2 * margin
     if isinstance(light, AmbientLight):
         return ()
     if isinstance(light, DirectionalLight):
         forward = normalize(light.direction)
-        pose = _pose(center.astype(forward.dtype) - 2 * radius * forward, forward)
+        pose = _pose(scene_center.astype(forward.dtype) - 2 * scene_radius * forward, forward)
         middle = [map_size / 2, map_size / 2]
-        return (OrthographicCamera(inner / (2 * radius), middle, pose),)
+        return (OrthographicCamera(inner / (2 * scene_radius), middle, pose),)
     if isinstance(light, SpotLight):
         check(
             "light_cameras(light)",

@@ -87,7 +87,7 @@ def prefiltered(
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and texels, as in `hard`, with the same defaults: the
+    - `bias`, `slope_bias`: as in `hard`, with the same defaults: the
       mean of a plane's depths is that of its middle.
 
     **Returns:** height width, 0 or 1, in the type of the receivers. A filter that reaches an
@@ -145,7 +145,7 @@ def pcf(
 
     - `shadow_map`, `receivers`: height width, as in `hard`.
     - `size`: static; odd, in texels. The filter lies around the texel that holds the receiver.
-    - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, half
+    - `bias`, `slope_bias`: as in `hard`. Where both are left out, half
       of `size` texels of slope, half of `softness` and what rounding needs: a plane is lit, and
       where an occluder touches it, its shadow starts at most a filter's width away.
     - `softness`: scene units; the comparison rises from 0 to 1 by a smoothstep of this width,

@@ -39,7 +39,7 @@ def pcss(
     - `size`: static; odd, in texels. A penumbra that is wider is cut to it.
     - `light_size`: the light's diameter, in scene units before a pinhole camera, in radians,
       as seen from the scene, before an orthographic one.
-    - `bias`, `slope_bias`, `softness`: scene units and texels, as in `pcf`.
+    - `bias`, `slope_bias`, `softness`: as in `pcf`.
 
     **Returns:** height width, in [0, 1], in the type of the receivers.
 

@@ -42,7 +42,7 @@ def variance(
       as the farthest depth of map and receivers; so does what is 1e12 times as far behind the
       nearest as the receivers.
     - `size`: static; odd, in texels.
-    - `bias`, `slope_bias`: scene units and texels, as in `hard`. Where both are left out, what
+    - `bias`, `slope_bias`: as in `hard`. Where both are left out, what
       rounding needs: a plane's mean depth, read between texels, is the plane's.
     - `min_variance`: scene units squared; the variance is at least this.
 

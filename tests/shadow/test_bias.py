@@ -58,7 +58,9 @@ def on_a_plane(light, tilt, dtype, eye=None, turn=0.4):
     eye = eye or PinholeCamera.look_at(
         [0, -2, 0], [0, 1, 4], up=[0, -1, 0], fov_y=0.7, height=SIDE, width=SIDE
     )
-    cameras = shadow.light_cameras(light, map_size=MAP, center=POINT, radius=3.0, margin=11)
+    cameras = shadow.light_cameras(
+        light, map_size=MAP, scene_center=POINT, scene_radius=3.0, margin=11
+    )
     maps = [plane_depth(camera, normal, MAP, dtype) for camera in cameras]
     shadow_map = np.concatenate(maps, axis=1)
     depth = plane_depth(eye, normal, SIDE, dtype)
@@ -96,7 +98,9 @@ def test_receivers_between_texels_are_lit_too():
     """Pixels' centres on the borders of texels, where a filter's far corner is farthest."""
     up = PinholeCamera.look_at([0, -2, 4], POINT, up=[0, 0, 1], fov_y=1, height=4, width=4)
     light = DirectionalLight([0.0, 1.0, 0.0], WHITE)
-    (camera,) = shadow.light_cameras(light, map_size=MAP, center=POINT, radius=3.0, margin=11)
+    (camera,) = shadow.light_cameras(
+        light, map_size=MAP, scene_center=POINT, scene_radius=3.0, margin=11
+    )
     middle = [SIDE / 2 + 0.5] * 2
     eye = OrthographicCamera(camera.pixels_per_unit, middle, up.world_from_camera)
     for dtype, size in ((np.float32, 5), (np.float64, 5), (np.float32, 21)):

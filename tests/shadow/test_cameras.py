@@ -22,7 +22,7 @@ LIGHTS = {
 def test_a_directional_light_takes_in_the_ball():
     center, radius = np.array([1.0, 2.0, 3.0]), 2.0
     (camera,) = shadow.light_cameras(
-        LIGHTS["sun"], map_size=64, center=center, radius=radius, margin=4
+        LIGHTS["sun"], map_size=64, scene_center=center, scene_radius=radius, margin=4
     )
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500, 3))
@@ -77,7 +77,7 @@ def test_errors_name_their_argument():
     wide = SpotLight([0, 0, 0], [0, 0, 1], WHITE, 0.5, 1.6)
     for name, light, options in (
         ("margin=...", POINT, {"margin": 4}),
-        ("radius=...", POINT, {"radius": 0.0}),
+        ("scene_radius=...", POINT, {"scene_radius": 0.0}),
         ("light", wide, {}),
         ("light", "sun", {}),
     ):

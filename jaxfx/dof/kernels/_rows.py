@@ -1,12 +1,12 @@
-"""Scatter turned round, by rows of offsets, each over the whole picture.
+"""Scatter as a gather, by rows of offsets, each over the whole image.
 
 For devices on which a launch costs more than what it computes: a turn of the loop adds all taps
 of a row, or of several, in a kernel or two. The turns are as many as the largest sprite has
-rows, known when the program is compiled, so that nobody has to look at what was computed. The
-adjoint is the same sweep, owned by the sources: no scatter is left.
+rows, which is known when the program is compiled: the host looks at no result. The adjoint is
+the same sweep, owned by the sources: no scatter is left.
 
 What it does not do well: every tap of the largest sprite is computed at every pixel, whatever
-the picture holds.
+the image holds.
 """
 
 import functools as ft
@@ -23,8 +23,8 @@ from jaxfx.dof.kernels._taps import Sweep, inside
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
-# The most that one kernel takes, in taps times planes that are read; and in that times sums.
-# Given more, XLA keeps what several sums share in memory, for every tap.
+# The most work of one kernel: taps times planes that are read; and that times sums. With more,
+# XLA writes what several sums share to memory, for every tap; chosen by compiling for an H100.
 _READS, _COST = 580, 2300
 
 

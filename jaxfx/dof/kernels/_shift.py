@@ -1,4 +1,4 @@
-"""Scatter turned round: for every offset, one shifted multiply-add over the whole image.
+"""Scatter as a gather: for every offset, one shifted multiply-add over the whole image.
 
 No scatter is left in the program. Taps that no sprite reaches are computed all the same, so its
 cost is that of the largest sprite at every pixel. The loop's body is rematerialised, so that a

@@ -1,7 +1,7 @@
 """A slice of sprites, painted by spans block by block, and the adjoint of that.
 
 A slice is the sprites of about one defocus, so that all of them have about one radius. Blocks
-that hold none are passed over, and in the others a slice's sprites are gathered first.
+that hold none are skipped; in the others the sprites of the slice are gathered first.
 
 Where the defocus changes along a surface, its points crowd together as seen from one side of
 the lens and thin out from the other: a sprite's weight at an offset is `1 + tilt . offset`.
@@ -11,7 +11,7 @@ which keeps its sum and gives it the same centre.
 A running sum rounds what it carries: sprites that are large beside what a pixel sums to are
 painted tap by tap instead.
 
-What it does not do well: scattered writes use one core.
+What it does not do well: XLA writes scattered values on one core.
 """
 
 import functools as ft
@@ -29,13 +29,15 @@ from jaxfx.dof.kernels._tiles import inside
 from jaxfx.dof.sprites import POINT_RADIUS, reach, segment_integral
 
 
-# The steps of a block and of what its sprites reach fill half a megabyte at a radius of 32.
+# Height and width of a block in pixels: with the margin that its sprites reach it takes half a
+# megabyte at a radius of 32, which fits a core's cache. Larger blocks do not.
 BLOCK = (64, 64)
-# So many of a block's sprites are painted at a time, and so many of those that go by taps.
+# Sprites painted per turn of a loop: by spans, and tap by tap. More waste work on empty places,
+# fewer cost turns.
 CHUNK, BRIGHT_CHUNK = 1024, 16
-# At most so many slices lie to either side of the focus.
+# The most slices to either side of the focus: bounds the time for a tiny threshold.
 SLICES = 128
-# At most so many slices later are those of the next sheet.
+# Slices between the numbers of one sheet and those of the next: more than one sheet can have.
 APART = 2 * SLICES + 2
 
 
@@ -77,15 +79,16 @@ class Sheets(NamedTuple):
 
 
 def ordered(place: Float[Array, "sheet height width"]) -> Float[Array, "sheet height width"]:
-    """The places of all sheets, one sheet after the other."""
+    """The places of all sheets on one scale, each sheet behind the one before it."""
     apart = jax.lax.stop_gradient(jnp.ceil(place.max()) - jnp.floor(place.min()) + 2)
     return place + apart * jnp.arange(len(place), dtype=place.dtype)[:, None, None]
 
 
 def share_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """The part of a sprite that belongs to a slice so many slices away: 1 at 0, 0 from 1 on.
+    """Share of a sprite that belongs to a slice at a distance, in slices: 1 at 0, 0 from 1 on.
 
-    Both of its slices together have all of it. It has no kink, where derivatives would be lost.
+    The shares of the two nearest slices add up to 1. The function is smooth, so that no
+    derivative is lost at a kink.
     """
     t = clip01(jnp.abs(beyond))
     return 1 - t * t * (3 - 2 * t)
@@ -100,23 +103,25 @@ def share_slope_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def _begun(
     value: Float[Array, "disc value"],
 ) -> tuple[Float[Array, "disc step"], Float[Array, "disc step"]]:
-    """What an end adds to the steps where a span begins, and what of a pixel that it cuts."""
+    """What the start of a span adds to the running steps, and to the pixel that it cuts."""
     nothing = jnp.zeros_like(value)
     return jnp.concatenate([value, nothing], axis=1), jnp.concatenate([nothing, value], axis=1)
 
 
 def across_of(reach: int) -> int:
-    """How many pixels along a row a sprite reaches that a tilt has moved."""
+    """How many pixels along a row a sprite reaches, moved by the largest tilt."""
     return -(-4 * (2 * reach + 1) // 6) + 1
 
 
 class _End(NamedTuple):
-    """Where the spans of some discs begin (`side` -1) or end (1), in one row of each.
+    """The starts (`side` -1) or the ends (1) of the spans of some discs, in one row of each.
 
-    - `row`: its distance. `cell`: the window's cell that holds the end, after `cut` of it.
-    - `facing`: the factor of the row. `by_tilt`, `by_radius`: how the end moves with them.
-
-    A tap is an end that leaves the running sum alone, `whole` 0, and whose `cut` is its cover.
+    - `row`: offset of the row from the centre of the disc, in pixels.
+    - `cell`: index of the window's cell in which the end lies; `cut`: where in it, 0 to 1.
+    - `facing`: weight of the row by the tilt. `by_tilt`, `by_radius`: derivatives of the place
+      of the end in the tilt along x and in the radius.
+    - `whole`: 1; or 0 for a single tap, which leaves the running sum alone and whose `cut` is
+      its coverage.
     """
 
     side: int
@@ -130,9 +135,10 @@ class _End(NamedTuple):
 
 
 class Grid:
-    """How sheets are divided into blocks, and where in a block's window its spans lie.
+    """Sheets divided into blocks, and the window into which a block's spans are painted.
 
-    A window is a block and what its sprites can reach, and below it a row that nobody reads.
+    A window is the block with the margin that its sprites can reach. One more row below it
+    takes writes that no one reads.
     """
 
     def __init__(self, reach: int, sheets: Sheets):
@@ -148,9 +154,9 @@ class Grid:
     def discs(
         self, sheets: Sheets, dot: Sheets | None = None
     ) -> Float[Array, "block disc plane"]:
-        """One row a disc: its value, radius, tilt, place, and whether it goes by taps.
+        """One row per disc: value, radius, tilt, place, and 1 if it is painted tap by tap.
 
-        The place of one that does not count is infinite. Given `dot`, the same of a tangent.
+        The place of a disc that does not count is inf. Given `dot`, the same of a tangent.
         """
         value, radius, tilt, place = dot or sheets
         by_taps, fill = jnp.zeros_like(place), 0.0
@@ -180,7 +186,7 @@ class Grid:
         return Sheets(planes[:, :v], planes[:, v], planes[:, v + 1 : v + 3], planes[:, v + 3])
 
     def _counts(self, sheets: Sheets) -> Bool[Array, "sheet height width"]:
-        """Which sprites are let through and reach the frame."""
+        """Mask of the sprites that are let through and reach the frame."""
         far = [
             jnp.maximum(
                 jnp.abs(jnp.arange(n, dtype=sheets.radius.dtype) - (n - 1) / 2)
@@ -224,7 +230,7 @@ class Grid:
         discs: Float[Array, "block disc plane"],
         dots: Float[Array, "block disc plane"] | None = None,
     ) -> Float[Array, "value height width"]:
-        """The sum of a slice's sprites in the frame; with `dots`, then its derivative."""
+        """The sum of a slice's sprites in the frame; with `dots` also its derivative, appended."""
         v = self.values
         channels = v if dots is None else 2 * v
 
@@ -282,7 +288,7 @@ class Grid:
         bar: Float[Array, "value height width"],
         bars: Float[Array, "block disc plane"],
     ) -> Float[Array, "block disc plane"]:
-        """The adjoint of `paint` at `bar`, added to `bars`: steps read as they were written."""
+        """The adjoint of `paint` at `bar`, added to `bars`: it reads where `paint` writes."""
         v = self.values
         canvas = self._canvas(v, discs.dtype)
         at = (0, 2 * self.reach, self.reach + self.across)
@@ -333,15 +339,15 @@ class Grid:
         return jnp.zeros((channels, *size), dtype)
 
     def _corner(self, block: Int[Array, ""]) -> tuple[Any, ...]:
-        """Where the window of a block lies."""
+        """Start of a block's window in the canvas."""
         (down, across), (tall, wide) = self.blocks, self.block
         block = block % (down * across)
         return 0, block // across * tall, block % across * wide
 
     def _each_chunk(self, index, block, discs, visit, carry):
-        """Fold `visit(carry, block, discs, share, its slope, column)` over a slice's discs.
+        """Fold `visit(carry, block, discs, share, slope of share, column)` over a slice's discs.
 
-        Bright discs come several times, for a `column` of taps each; for all others it is None.
+        A disc that is painted tap by tap comes once per `column`; for others `column` is None.
         """
         beyond = discs[block, :, self.values + 3] - index.astype(discs.dtype)
         bright = discs[block, :, self.values + 4] > 0

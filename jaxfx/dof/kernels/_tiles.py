@@ -1,4 +1,4 @@
-"""Scatter turned round, tile by tile, each tile as far as the sprites that can reach it.
+"""Scatter as a gather, tile by tile, each tile as far as the sprites that can reach it.
 
 Every tile loops over rows of offsets, out to the largest radius that matters to it, and along a
 row in runs of 17, out to where that radius ends there. The offsets of a run are written out, so
