@@ -1,4 +1,4 @@
-"""Where pixels are. The pixel-centre rule of the package lives here alone.
+"""Pixel centres, and reads of images at points. The rule of pixel centres is stated here alone.
 
 Pixel (row j, column i) covers [i, i + 1) x [j, j + 1); its centre is (i + 0.5, j + 0.5), and
 coordinates are always (x, y).
@@ -23,7 +23,7 @@ def pixel_centers(
 def nearest(
     image: Shaped[Array, "height width ..."], points: Float[Array, "*batch 2"]
 ) -> Shaped[Array, "..."]:
-    """The value of the pixel that covers each point (x, y); the frame's own beyond it."""
+    """The value of the pixel that covers each point (x, y); outside, the nearest pixel's."""
     height, width = image.shape[:2]
     x, y = _cell(points[..., 0], width), _cell(points[..., 1], height)
     return image[y, x]
@@ -32,28 +32,28 @@ def nearest(
 def bilinear(
     image: Float[Array, "height width ..."], points: Float[Array, "*batch 2"]
 ) -> Float[Array, "..."]:
-    """The mean of the four pixels about each point (x, y), the frame's own repeated beyond it.
+    """Bilinear interpolation at each point (x, y); outside, the border pixels are repeated.
 
     Differentiable in both; at a pixel's centre the derivative in the point is the one from
-    above. A pixel that is not finite and has no share is left out: it spoils nothing.
+    above. A pixel of weight 0 that is not finite is left out: it spoils nothing.
     """
     height, width = image.shape[:2]
     corner = jax.lax.stop_gradient(jnp.floor(points - 0.5))
-    share = points - 0.5 - corner
+    fraction = points - 0.5 - corner
     total = jnp.zeros(points.shape[:-1] + image.shape[2:], image.dtype)
     for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
         x = _cell(corner[..., 0] + dx, width)
         y = _cell(corner[..., 1] + dy, height)
-        along = share[..., 0] if dx else 1 - share[..., 0]
-        weight = along * (share[..., 1] if dy else 1 - share[..., 1])
+        weight_x = fraction[..., 0] if dx else 1 - fraction[..., 0]
+        weight = weight_x * (fraction[..., 1] if dy else 1 - fraction[..., 1])
         weight = weight.astype(image.dtype).reshape(weight.shape + (1,) * (image.ndim - 2))
         value = image[y, x]
-        outside = (weight == 0) & ~jnp.isfinite(value)
-        total = total + weight * jnp.where(outside, 0, value)
+        is_unusable = (weight == 0) & ~jnp.isfinite(value)
+        total = total + weight * jnp.where(is_unusable, 0, value)
     return total
 
 
 def _cell(coordinate: Float[Array, "*batch"], size: int) -> Int[Array, "*batch"]:
-    """The index of the row or column that holds a coordinate, the nearest one outside."""
-    held = jnp.clip(jax.lax.stop_gradient(coordinate), 0, size - 1)
-    return jnp.where(jnp.isnan(held), 0, held).astype(jnp.int32)
+    """The index of the row or column that holds a coordinate; outside, the nearest; NaN, 0."""
+    clipped = jnp.clip(jax.lax.stop_gradient(coordinate), 0, size - 1)
+    return jnp.where(jnp.isnan(clipped), 0, clipped).astype(jnp.int32)

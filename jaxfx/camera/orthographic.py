@@ -16,7 +16,7 @@ from jaxfx.camera.rigid import (
     Depths,
     Pixels,
     Points,
-    each,
+    broadcast_like,
     read_map,
     read_pixels,
     read_points,
@@ -151,7 +151,7 @@ class OrthographicCamera(eqx.Module):
         dtype = points.dtype
         local = to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         pixels = local[..., :2] * self.pixels_per_unit.astype(local.dtype)
-        pixels = pixels + each(self.center, pixels)
+        pixels = pixels + broadcast_like(self.center, pixels)
         return Projection(pixels.astype(dtype), local[..., 2].astype(dtype))
 
     def unproject(self, pixels: Pixels, depth: Depths) -> Float[Array, "... 3"]:
@@ -176,7 +176,7 @@ class OrthographicCamera(eqx.Module):
         [0.5 0.  2. ]
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
-        plane = pixels - each(self.center, pixels)
+        plane = pixels - broadcast_like(self.center, pixels)
         plane = plane / self.pixels_per_unit.astype(pixels.dtype)
         local = jnp.concatenate([plane, depth[..., None]], axis=-1)
         return to_world(self.world_from_camera, local).astype(dtype)

@@ -1,4 +1,7 @@
-"""What cameras share: points in and out of their axes, and what they read."""
+"""Rigid poses: points to and from camera axes, and the arguments that both cameras check.
+
+Used by both cameras, `jaxfx.reproject` and `jaxfx.shadow`.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,56 +23,60 @@ Pixels = Num[ArrayLike, "... 2"] | Sequence[Any]
 Depths = Num[ArrayLike, "..."] | float | int | Sequence[Any]
 DepthMap = Num[ArrayLike, "height width"] | Sequence[Any]
 
-# How far a rotation's columns may be from orthonormal: files hold four digits.
+# A number without unit: how far entries of R^T R may be from the identity's. Files hold four
+# digits; with less they are refused, with more a slight scale passes for a rotation.
 _ORTHONORMAL = 1e-3
 
 
-def each(vector: Float[Array, " n"], like: Float[Array, "... n"]) -> Float[Array, "... n"]:
-    """`vector` for every one of `like`'s."""
+def broadcast_like(
+    vector: Float[Array, " n"], like: Float[Array, "... n"]
+) -> Float[Array, "... n"]:
+    """`vector`, broadcast to the shape of `like`."""
     return jnp.broadcast_to(vector.astype(like.dtype), like.shape)
 
 
 def transformed(
     matrix: Float[Array, "3 3"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
-    """`matrix` times each of `points`, written out: a matrix product would not be fused."""
+    """`matrix` times each point, written as sums: XLA would not fuse a matrix product."""
     columns = matrix.astype(points.dtype).T
-    x, y, z = (points[..., i : i + 1] * each(columns[i], points) for i in range(3))
+    x, y, z = (points[..., i : i + 1] * broadcast_like(columns[i], points) for i in range(3))
     return x + y + z
 
 
 def to_world(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
-    """Points in camera axes, in the world's."""
+    """World points of points in camera axes."""
     pose = world_from_camera.astype(points.dtype)
-    return transformed(pose[:3, :3], points) + each(pose[:3, 3], points)
+    return transformed(pose[:3, :3], points) + broadcast_like(pose[:3, 3], points)
 
 
 def to_camera(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
-    """Points in world axes, in the camera's."""
+    """Points in camera axes of world points."""
     pose = world_from_camera.astype(points.dtype)
-    return transformed(pose[:3, :3].T, points - each(pose[:3, 3], points))
+    return transformed(pose[:3, :3].T, points - broadcast_like(pose[:3, 3], points))
 
 
 def rigid_pose(name: str, value: Any) -> Float[Array, "4 4"]:
-    """A rigid motion; `ValueError` for anything else that can be looked at."""
+    """`value` as a rigid pose; `ValueError` for any other. Traced values are not checked."""
     pose = parameter(name, value, (4, 4))
-    room = max(_ORTHONORMAL, 8 * float(jnp.finfo(pose.dtype).eps))
+    tolerance = max(_ORTHONORMAL, 8 * float(jnp.finfo(pose.dtype).eps))
 
     def is_rigid(numbers):
-        turn, last = numbers[:3, :3].astype(np.float64), numbers[3]
-        is_turn = np.abs(turn.T @ turn - np.eye(3)).max() < room and np.linalg.det(turn) > 0
-        return is_turn and np.isfinite(numbers).all() and (last == [0, 0, 0, 1]).all()
+        rotation, last = numbers[:3, :3].astype(np.float64), numbers[3]
+        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+        is_rotation = deviation < tolerance and np.linalg.det(rotation) > 0
+        return is_rotation and np.isfinite(numbers).all() and (last == [0, 0, 0, 1]).all()
 
     check(name, pose, is_rigid, "a rotation and a finite position over the row 0 0 0 1")
     return pose
 
 
 def read_points(camera: Any, method: str, points: Any, size: int) -> Array:
-    """World points or pixels, in a float type; `ValueError` names what is none."""
+    """World points (`size` 3) or pixels (2), as floats; `ValueError` for a wrong shape."""
     name = f"{method}({'points' if size == 3 else 'pixels'})"
     check_fields(f"{type(camera).__name__}.{method}", camera)
     points = parameter(name, points, None)
@@ -79,7 +86,7 @@ def read_points(camera: Any, method: str, points: Any, size: int) -> Array:
 
 
 def read_pixels(camera: Any, pixels: Any, depth: Any) -> tuple[Array, Array, Any]:
-    """Pixels and depths that fit, in the type to compute in; and the type of the result."""
+    """Pixels and depths of one shape in the type to compute in, and the type of the result."""
     pixels = read_points(camera, "unproject", pixels, 2)
     depth = parameter("unproject(depth)", depth, None)
     try:
@@ -96,7 +103,7 @@ def read_pixels(camera: Any, pixels: Any, depth: Any) -> tuple[Array, Array, Any
 
 
 def read_map(depth: Any) -> tuple[Array, Array, Any]:
-    """The pixels of a depth image, and it, in the type to compute in; and its own type."""
+    """Pixel centres and depth in the type to compute in, and the type of `depth`."""
     depth = check_map("points(depth)", depth)
     working = working_dtype(depth.dtype)
     height, width = depth.shape
@@ -104,9 +111,9 @@ def read_map(depth: Any) -> tuple[Array, Array, Any]:
 
 
 def at_origin(camera: Any) -> Any:
-    """A camera of either kind, turned as it is, at the world's origin.
+    """The camera with its rotation, moved to the world's origin.
 
-    For what does not depend on where it stands: a difference of two points far away from the
+    For whatever does not depend on its position: a difference of two points far away from the
     origin would have few digits left.
     """
     pose = camera.world_from_camera.at[:3, 3].set(0)
@@ -114,23 +121,23 @@ def at_origin(camera: Any) -> Any:
 
 
 def per_depth(camera: Any, pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
-    """How far rays through pixels lead in the world, for each unit of depth.
+    """The world vector by which the ray of each pixel advances per unit of depth.
 
-    Of no two points of a ray: those of a scene of 1e6 differ by a unit of depth in few digits.
+    Not a difference of two points of the ray: for a scene at 1e6 few digits would be left.
     """
-    turn, pixels = camera.world_from_camera[:3, :3], homogeneous(pixels)
+    rotation, pixels = camera.world_from_camera[:3, :3], homogeneous(pixels)
     if hasattr(camera, "intrinsics"):
-        return transformed(turn, transformed(inverse(camera.intrinsics), pixels))
-    return each(turn[:, 2], pixels)
+        return transformed(rotation, transformed(inverse(camera.intrinsics), pixels))
+    return broadcast_like(rotation[:, 2], pixels)
 
 
 def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
-    """Pixels with a one."""
+    """Homogeneous pixels (x, y, 1)."""
     return jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
 
 
 def look_at_pose(eye: Any, at: Any, up: Any) -> Float[Array, "4 4"]:
-    """At `eye`, with `at` ahead and `up` towards the top of the picture."""
+    """The pose at `eye` that looks at `at`, with `up` towards the top of the image."""
     eye = parameter("look_at(eye)", eye, (3,))
     at = parameter("look_at(at)", at, (3,))
     up = parameter("look_at(up=...)", up, (3,))

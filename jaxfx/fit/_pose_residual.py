@@ -106,7 +106,7 @@ class Residual(eqx.Module):
         differences = [(gain * shown + offset - reference) / scale[0]]
         if views.reference_depth is not None:
             own_depth = self._thinned(views.reference_depth)
-            depth = safe_divide(jnp.ones_like(view.inverse_depth), -view.inverse_depth)
+            depth = safe_divide(jnp.ones_like(view.reciprocal_depth), view.reciprocal_depth)
             point = views.source.unproject(view.pixels, depth)
             point = jnp.where(view.mask[:, None], point, 0)
             seen_depth = camera.project(point)[1].reshape(size)

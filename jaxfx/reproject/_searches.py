@@ -34,8 +34,8 @@ from jaxfx.reproject._crossings import (
 from jaxfx.reproject._traversal import traverse
 
 
-# Equal steps of "linear" and "relief" by default. tests/reproject/test_searches.py has the errors
-# at other numbers; a change alters what they find.
+# Equal steps of "linear" and "relief" by default. The errors at other numbers are in
+# tests/reproject/test_searches.py; a change alters what they find.
 _DEFAULT_STEPS = 64
 # Bisections of "relief": its hit lies within 1/256 of a step of the crossing. A change alters
 # what it finds.

@@ -66,8 +66,8 @@ _PACKING_RATIO = 3
 # Steps between two checks of an accelerator's host whether any ray is unfinished. Each check
 # waits for the device; up to 5 steps are wasted at the end. A wrong value costs time only.
 _STEPS_PER_CHECK = 6
-# Levels. A ray goes down by two where it reaches a value, up by one where it leaves the cell two
-# levels above. Measured: a seventh fewer steps than with one. Any value gives the same hit.
+# Levels. A ray goes down by two where it reaches a value, up by one where it leaves the cell
+# two levels above. Measured: a seventh fewer steps than with one. Any value gives the same hit.
 _LEVEL_STRIDE = 2
 # Cells. The first level is such that a ray crosses at most 4 of its cells between the nearest
 # and the farthest value. Measured. Any value gives the same hit.

@@ -85,7 +85,9 @@ def blend(
     size = check_size("blend", height, width, images[0].shape[:2])
     check_search("blend", search)
     hole_threshold = check_threshold("blend", hole_threshold)
-    return _blended(images, depths, cameras, target, size, search, hole_threshold)
+    pixels = pixel_centers(*size).reshape(-1, 2)
+    options = {"search": search, "hole_threshold": hole_threshold}
+    return _blended(images, depths, cameras, target, pixels, size, options)
 
 
 @eqx.filter_jit
@@ -94,13 +96,14 @@ def _blended(
     depths: list,
     cameras: list,
     target: Camera,
+    pixels: Array,
     size: tuple[int, int],
-    search: str,
-    hole_threshold: int | float,
+    options: dict[str, Any],
 ) -> tuple[Float[Array, "rows columns channel"], Float[Array, "rows columns"]]:
-    """`blend` of checked arguments; `size` is height and width of the result, in pixels."""
-    pixels = pixel_centers(*size).reshape(-1, 2)
-    options = {"search": search, "hole_threshold": hole_threshold}
+    """`blend` of checked arguments, by rays through `pixels` of the target, ray 2.
+
+    `size` is height and width of the result in pixels, `options` are those of `trace_pixels`.
+    """
 
     def warped(image: Array, depth: Array, camera: PinholeCamera) -> tuple[Array, ...]:
         view, cosine, target_depth = trace_with_angle(depth, camera, target, pixels, **options)
@@ -109,7 +112,7 @@ def _blended(
 
     colors, mask, cosine, target_depth = _over_cameras(warped, images, depths, cameras)
     nearest = jnp.min(jnp.where(mask, target_depth, jnp.inf), axis=0)
-    is_in_front = mask & (target_depth <= (1 + hole_threshold) * nearest[None])
+    is_in_front = mask & (target_depth <= (1 + options["hole_threshold"]) * nearest[None])
     weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0))[..., None]
     weight = weight.astype(colors.dtype)
     total = sum_planes(jnp.where(weight > 0, colors, 0) * weight)

@@ -34,14 +34,15 @@ class View(NamedTuple):
     """What some target pixels show of a camera's image and depth.
 
     - `pixels`: pixel coordinates (x, y) in the camera's image.
-    - `inverse_depth`: -1/z in the camera, in 1 / scene units; 0 at infinity.
+    - `reciprocal_depth`: 1/z in the camera, in 1 / scene units; 0 at infinity. It is the
+      inverse depth -1/z with its sign changed.
     - `mask`: whether the pixel shows anything; where not, all weights of `patch` are 0.
     - `patch`: the stencil by which an image of the camera is read there.
     - `steps`: steps of the search.
     """
 
     pixels: Float[Array, "ray 2"]
-    inverse_depth: Float[Array, " ray"]
+    reciprocal_depth: Float[Array, " ray"]
     mask: Bool[Array, " ray"]
     patch: Patch
     steps: Int[Array, " ray"]
@@ -85,7 +86,7 @@ def trace_pixels(
     is_visible = hit.mask & ~is_behind_gap & is_known[row, column]
     patch = edge_aware_patch(inverse_depth, x, y, anchor, hole_threshold)
     patch = patch._replace(weights=jnp.where(is_visible[None], patch.weights, 0))
-    return View(jnp.stack([x, y], axis=-1), z / unit, is_visible, patch, hit.steps)
+    return View(jnp.stack([x, y], axis=-1), -z / unit, is_visible, patch, hit.steps)
 
 
 def _comes_through_gap(
@@ -157,13 +158,13 @@ def trace_with_angle(
     camera_rays, target_rays = per_depth(camera, view.pixels), per_depth(target, pixels)
     cosine = jnp.sum(normalize(camera_rays) * normalize(target_rays), axis=-1)
     # Computed without a point of the world, whose square overflows for a sky at 1e20.
-    is_at_infinity = view.inverse_depth >= 0
+    is_at_infinity = view.reciprocal_depth <= 0
     camera_pose, target_pose = camera.world_from_camera, target.world_from_camera
     axis, offset = target_pose[:3, 2], camera_pose[:3, 3] - target_pose[:3, 3]
     per_unit, constant = (
         jnp.sum(v * axis[None].astype(v.dtype), axis=-1)
         for v in (camera_rays, offset[None].astype(camera_rays.dtype))
     )
-    target_depth = per_unit / jnp.where(is_at_infinity, 1, -view.inverse_depth) + constant
+    target_depth = per_unit / jnp.where(is_at_infinity, 1, view.reciprocal_depth) + constant
     target_depth = jnp.where(is_at_infinity, jnp.inf, target_depth)
     return AngledView(view, jnp.maximum(cosine, 0), target_depth)

@@ -22,7 +22,7 @@ def test_a_plane_is_seen_where_its_points_project_to():
     shown = np.asarray(view.mask)
     assert shown.sum() > 400
     np.testing.assert_allclose(view.pixels[shown], expected[shown], atol=1e-9)
-    np.testing.assert_allclose(view.inverse_depth[shown], -1 / 4, atol=1e-12)
+    np.testing.assert_allclose(view.reciprocal_depth[shown], 1 / 4, atol=1e-12)
     np.testing.assert_allclose(target_depth[shown], 3.5, atol=1e-9)
     eyes = [np.asarray(e.world_from_camera)[:3, 3] for e in (eye, target)]
     rays = [np.asarray(points) - position for position in eyes]
