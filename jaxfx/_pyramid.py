@@ -39,14 +39,14 @@ class Pyramid(eqx.Module):
         return self.values[start : start + height * width].reshape(height, width)
 
 
-def minimum_pyramid(depth: Float[Array, "height width"]) -> Pyramid:
+def minimum_pyramid(values: Float[Array, "height width"]) -> Pyramid:
     """The pyramid of minima: no cell is farther than any texel that it covers."""
-    return _pyramid(depth, jnp.minimum, np.inf)
+    return _pyramid(values, jnp.minimum, np.inf)
 
 
-def maximum_pyramid(depth: Float[Array, "height width"]) -> Pyramid:
+def maximum_pyramid(values: Float[Array, "height width"]) -> Pyramid:
     """The pyramid of maxima: no cell is nearer than any texel that it covers."""
-    return _pyramid(depth, jnp.maximum, -np.inf)
+    return _pyramid(values, jnp.maximum, -np.inf)
 
 
 def level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
@@ -58,10 +58,10 @@ def level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
     return tuple(shapes)
 
 
-def _pyramid(depth: Array, combine: Callable, identity: float) -> Pyramid:
+def _pyramid(values: Array, combine: Callable, identity: float) -> Pyramid:
     """The pyramid by `combine`, whose `identity` pads levels of odd size."""
-    shapes = level_shapes(*depth.shape)
-    levels = [depth]
+    shapes = level_shapes(*values.shape)
+    levels = [values]
     for height, width in shapes[1:]:
         finer = levels[-1]
         padding = [(0, 2 * height - finer.shape[0], 0), (0, 2 * width - finer.shape[1], 0)]
