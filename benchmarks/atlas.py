@@ -4,7 +4,7 @@ Measures the methods of depth of field, blur, reprojection, ray search, shadows,
 a bounce of light, and the plans of `budget`, at several settings on two scenes each, the second
 made to fail. Writes `atlas.csv`, a row for each measurement, `atlas.txt`, the machine, and for
 each effect the charts of time and of memory against error, on each scene, and of time and error
-against the size of the picture and against the effect's own size, as PNG and SVG. Nothing else
+against the size of the image and against the effect's own size, as PNG and SVG. Nothing else
 should run meanwhile.
 """
 
@@ -49,7 +49,7 @@ import matplotlib.pyplot as plt
 from matplotlib.ticker import LogLocator
 
 
-# A picture this near to the reference is drawn as this near: it differs by rounding.
+# An image this near to the reference is drawn as this near: it differs by rounding.
 EXACT = 80.0
 
 

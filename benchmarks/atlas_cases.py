@@ -37,7 +37,7 @@ LAMPS = {
 
 
 class Point(NamedTuple):
-    """Where methods are measured: a scene, the picture's side and the effect's own size."""
+    """Where methods are measured: a scene, the image's side and the effect's own size."""
 
     scene: str
     side: int
@@ -269,7 +269,7 @@ SEARCHES = ("pyramid", "descent", "linear", "relief")
 
 
 def searched(at: Point) -> Case:
-    """Slanting rays over a depth map, one for each texel; the picture is the depths hit."""
+    """Slanting rays over a depth map, one for each texel; the image is the depths hit."""
     y, x = np.mgrid[: at.side, : at.side] / at.side
     depth = 0.6 + 0.15 * np.sin(9 * x + 3 * y) * np.cos(7 * y - x)
     if at.scene == POSTS:  # One texel wide, as its gaps are.

@@ -1,4 +1,4 @@
-"""How the time of scatter grows with the radius and with the picture, beside native code.
+"""How the time of scatter grows with the radius and with the image, beside native code.
 
 `python -m benchmarks.growth --out docs` measures and draws `growth.csv` and `growth.png`,
 in about three minutes. Nothing else should run meanwhile.

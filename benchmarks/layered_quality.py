@@ -2,7 +2,7 @@
 
 `python -m benchmarks.layered_quality [MESH ...]` prints a row for each of three foci and
 two apertures of every scene, the still life if none is given: the PSNR of scatter with its best
-gamma and epsilon, of the whole picture and of the band of half the largest circle of confusion
+gamma and epsilon, of the whole image and of the band of half the largest circle of confusion
 about the edges in depth, and how much more one layer and two layers have.
 """
 
@@ -23,7 +23,7 @@ GAMMAS, EPSILONS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0), (0.5, 1.0, 2.0, 4.0, 8.0, 16.
 
 
 class Case:
-    """Views of a scene: a pinhole picture, what is behind it, and references through lenses."""
+    """Views of a scene: a pinhole image, what is behind it, and references through lenses."""
 
     def __init__(self, mesh, size, samples):
         self.mesh, self.samples = mesh, samples
@@ -48,7 +48,7 @@ class Case:
         return dof.accumulate(draw, self.camera, lens, samples=samples, progress=False).image
 
     def focused(self, share, largest):
-        """A lens with this share of what is seen before its focus, and its picture."""
+        """A lens with this share of what is seen before its focus, and its image."""
         seen = self.depth[jnp.isfinite(self.depth)]
         focus = float(jnp.quantile(seen, share))
         circles = self.lens(1.0, focus).circle_of_confusion(seen)

@@ -1,4 +1,4 @@
-"""Relighting beside Mitsuba, as pictures, and the error of the bounce against its rank.
+"""Relighting beside Mitsuba, as images, and the error of the bounce against its rank.
 
 `python -m benchmarks.relight_charts --out docs` writes `relight_truth.png`,
 `relight_bounce.png` and `relight_bounce.csv`, in some three minutes.
@@ -29,7 +29,7 @@ def shown(ax, title, image):
 
 
 def save(figure, path):
-    """As a picture of 128 colours, which is small."""
+    """As an image of 128 colours, which is small."""
     stream = BytesIO()
     figure.savefig(stream, format="png", dpi=120)
     Image.open(stream).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path)

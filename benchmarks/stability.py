@@ -1,4 +1,4 @@
-"""The stability atlas: every case in which methods fail, as one table with pictures.
+"""The stability atlas: every case in which methods fail, as one table with images.
 
 `python -m benchmarks.stability` measures every case of `tests/cases`, or those of the effects
 that it is given, and publishes them in `docs/stability`: for each effect a JSON file with what
@@ -73,7 +73,7 @@ def registered(effect: str) -> "list[Case]":
 
 def thumbnail(picture: Any) -> np.ndarray:
     """Linear values from 0 to 1 as a tile of bytes, in sRGB: the nearest pixel of the longer
-    side's square; grey where there is no picture, red where a value is not a number."""
+    side's square; grey where there is no image, red where a value is not a number."""
     if picture is None:
         return np.full((TILE, TILE, 3), 235, np.uint8)
     picture = np.asarray(picture, float)
@@ -134,7 +134,7 @@ def measure(effect: str) -> None:
 
 
 def _img(picture: np.ndarray) -> str:
-    """A picture in the page itself."""
+    """An image in the page itself."""
     file = io.BytesIO()
     Image.fromarray(picture).quantize(64).save(file, "png", optimize=True)
     text = base64.b64encode(file.getvalue()).decode()

@@ -1,7 +1,7 @@
 """Blur against OpenCV and SciPy, in one run: 1024 x 1024 x 3 float32, 9 taps each way.
 
 `pytest --benchmark-only benchmarks` prints each group with its medians, its spread and
-the ratios to its quickest. The floor: a picture of 12.6 MB is read once and written once by
+the ratios to its quickest. The floor: an image of 12.6 MB is read once and written once by
 each of two passes, 50 MB in all; OpenCV keeps some rows in its cache and moves half of that.
 """
 

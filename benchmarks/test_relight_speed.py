@@ -3,7 +3,7 @@
 `pytest --benchmark-only benchmarks/test_relight_speed.py` prints each group with its
 medians, its spread and the ratios to its quickest.
 
-The picture that an edit is compared with is rendered anew: Embree finds the surfaces and casts
+The image that an edit is compared with is rendered again: Embree finds the surfaces and casts
 a shadow ray from each towards each light, and every light is shaded.
 """
 

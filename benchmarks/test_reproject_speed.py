@@ -166,9 +166,9 @@ def test_peers(benchmark, peer):
 
 @pytest.mark.parametrize("method", ["scatter", "layered", "warp through 4 points", "16", "64"])
 def test_depth_of_field(benchmark, method):
-    """Looks through a lens by reprojecting one picture, beside what is made for it.
+    """Looks through a lens by reprojecting one image, beside what is made for it.
 
-    With each goes its PSNR to 256 pinhole pictures from all over the lens.
+    With each goes its PSNR to 256 pinhole images from all over the lens.
     """
     benchmark.group = "depth of field of the still life, 160 x 160"
     mesh, side = scene.still_life(), 160

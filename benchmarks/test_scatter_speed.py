@@ -90,7 +90,7 @@ def test_derivatives(benchmark, method, radius, mode):
 @pytest.mark.parametrize("how", ["batch", "one by one"])
 @pytest.mark.parametrize(("name", "radius"), [("tiles", 8), ("spans", 32)])
 def test_batch(benchmark, name, radius, how):
-    """Four pictures, of which one is blurred more than all others together."""
+    """Four images, of which one is blurred more than all others together."""
     benchmark.group = f"four pictures, {name}, radius {radius}"
     image, depth, lens = discs.two_discs(512, radius)
     images, depths = jnp.stack([jnp.asarray(image)] * 4), jnp.stack([jnp.asarray(depth)] * 4)

@@ -158,7 +158,7 @@ def _columns(
     """The pass down the columns, with a row of zeros above and one below.
 
     Rows are named by their index, held within the image. XLA keeps in memory what is padded,
-    where it would compute a bare sum anew for every tap that reads it.
+    where it would compute a bare sum again for every tap that reads it.
     """
     height = flat.shape[0]
     indices = np.arange(height)[:, None] + np.arange(-half, half + 1)

@@ -1,6 +1,6 @@
 """What compiled derivatives compute: as much as they need, and nothing again for every tap.
 
-Where a loop of taps reads something, XLA may compute it anew in each of them. Operations are
+Where a loop of taps reads something, XLA may compute it again in each of them. Operations are
 counted by XLA itself, in the program that it made.
 """
 

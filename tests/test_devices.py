@@ -54,7 +54,7 @@ TRANSFORMS = {
 
 
 def case_of(transform):
-    """Two pictures and lenses, one of them without a blur, as the transform takes them."""
+    """Two images and lenses, one of them without a blur, as the transform takes them."""
     pictures = [picture(0), picture(1)]
     images, depths = (jnp.stack(each) for each in zip(*pictures, strict=True))
     if transform == "batch of batches":
@@ -82,7 +82,7 @@ def test_accelerators_neither_scatter_nor_loop_without_a_known_end(name, transfo
         program = jax.make_jaxpr(TRANSFORMS[transform](METHODS[name]))(*case_of(transform))
     found = set(primitives(program.jaxpr))
     gathers = name == "gather" and "gradient" in transform
-    # What a bilinear tap reads is where a picture says: its transpose is a scatter.
+    # What a bilinear tap reads is where an image says: its transpose is a scatter.
     assert ("scatter-add" in found) == gathers
     assert "while" not in found
 

@@ -25,7 +25,7 @@ PICTURES = {"close": REFERENCE + 0.01, "far": REFERENCE + 0.1 * RNG.random(REFER
 
 
 class Method:
-    """Gives its picture and counts its calls."""
+    """Gives its image and counts its calls."""
 
     def __init__(self, picture):
         self.picture, self.calls = picture, 0

@@ -29,7 +29,7 @@ from tests.helpers.quick import optimised
 # run Python until they are done. Each of these states what it can do in its own tests.
 NOT_TRANSFORMED = {"scene", "exr", "io", "fit", "tradeoff", "budget"}
 
-# Nor functions of pictures: they give parameters, or no floats at all.
+# Nor functions of images: they give parameters, or no floats at all.
 NO_PICTURES = {"shadow.candidates", "shadow.light_cameras"}
 
 # Options that a function hands to another one, with which they are tested.
@@ -481,7 +481,7 @@ def test_nested_gradient_is_finite(case):
     _assert_finite(pushed(case)(arguments)[0])
 
 
-# A score of a picture may need a whole window of it; a picture may have any size.
+# A score of an image may need a whole window of it; an image may have any size.
 PICTURES = {name: case for name, case in OPTIONS.items() if not name.startswith("metrics.")}
 
 

@@ -1,4 +1,4 @@
-"""The multi-pass reference: many pinhole pictures through one lens, averaged."""
+"""The multi-pass reference: many pinhole images through one lens, averaged."""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Depth of field by blending the picture with one blurred copy."""
+"""Depth of field by blending the image with one blurred copy."""
 
 import functools as ft
 import math

@@ -184,7 +184,7 @@ def _explicit(image, depth, lens, edge, max_coc):
         return heat - jnp.pad(right, ((0, 0), (1, 0)))
 
     def step(channels, _):
-        # Each apart: what they give to the derivative in a conductance is added as pictures.
+        # Each apart: what they give to the derivative in a conductance is added as images.
         return tuple(map(flow, channels)), None
 
     @jax.checkpoint

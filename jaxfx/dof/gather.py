@@ -1,4 +1,4 @@
-"""Depth of field by a few taps a pixel, some of them from a low-resolution picture."""
+"""Depth of field by a few taps a pixel, some of them from a low-resolution image."""
 
 import functools as ft
 
@@ -103,7 +103,7 @@ def _gather(image, depth, lens, ramp, max_coc, disc):
 def _picture(image, depth, lens, ramp, max_coc, disc):
     """An accelerator takes as long to count as to add a tap: there, two of them at a time.
 
-    The derivatives would hold more than 40 pictures in memory, if they did so.
+    The derivatives would hold more than 40 images in memory, if they did so.
     """
     single = ft.partial(_drawn, max_coc=max_coc, disc=disc)
     pairs = ft.partial(single, at_once=2)
@@ -119,7 +119,7 @@ def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
     dtype = image.dtype
     view = defocused(image, depth, lens, max_coc)
     ramp = ramp.astype(view.image.dtype)
-    # What is bad is told by its colour, also in the low-resolution picture.
+    # What is bad is told by its colour, also in the low-resolution image.
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
     # One read gives a tap's colour, its defocus and how much of it has a depth.
     planes = [image, view.defocus[..., None], jnp.ones_like(image[..., :1])]
@@ -139,7 +139,7 @@ def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
         tap, defocus = mean[..., :-1], mean[..., -1]
         blur = absolute(defocus) / max_coc
         soft = bilinear(low, points / _SIDE + _LOW_RADIUS * offset)
-        # Where the low-resolution picture knows nothing, the tap stands for itself.
+        # Where the low-resolution image knows nothing, the tap stands for itself.
         share = jnp.where(soft[..., -1] > 0, blur, 0)
         tap = mix(tap, _mean(soft), share[..., None])
         behind = (defocus >= centre - rounding).astype(image.dtype)

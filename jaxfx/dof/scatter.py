@@ -38,7 +38,7 @@ _SECONDS: dict[Any, tuple[float, float, float, float]] = {
 
 # Visibility stays below e**60, so that its sums with highlights are finite in float32.
 _LOG_VISIBILITY = 60.0
-# An epsilon below this is this: no two circles of confusion of a picture lie so near.
+# An epsilon below this is this: no two circles of confusion of an image lie so near.
 _SMALLEST_EPSILON = 1e-6
 
 
@@ -178,7 +178,7 @@ def to_sprites(
 def _in_or_out_of_focus(
     image, depth, lens, gamma, epsilon, missing, max_coc, programs, coverage
 ):
-    """A picture wholly in focus is itself; its derivative is computed like any other."""
+    """An image wholly in focus is itself; its derivative is computed like any other."""
     blurred = ft.partial(_blurred, max_coc=max_coc, programs=programs, coverage=coverage)
 
     def is_sharp(_, depth, lens, *__):
@@ -229,12 +229,12 @@ def _quotient_jvp(primals, tangents):
 
 
 def cheapest(height: int, width: int, max_coc: int | float) -> Program:
-    """The program that takes a CPU least for a picture whose every sprite is the largest.
+    """The program that takes a CPU least for an image whose every sprite is the largest.
 
     Seconds are modelled as `fixed + pixels * (once + row * rows + tap * rows * columns)`, with
     `2 * reach + 1` rows and, in tiles, as many columns as their runs of taps come to; the
     constants were measured on two cores. What is fixed stands for the
-    time that a program takes to compile, shared by a few dozen pictures.
+    time that a program takes to compile, shared by a few dozen images.
     """
     pixels, far = height * width, reach(max_coc)
     rows = 2 * far + 1

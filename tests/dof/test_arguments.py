@@ -43,7 +43,7 @@ EACH = [
 # In these a pixel without a circle shows what reaches it; in the others its own colour.
 SPREADING = {name for name in METHODS if name.split()[0] in ("scatter", "layered", "separable")}
 SPREADING |= {"depth_sorted", "depth_sorted all"}
-# No method reads farther: gather's low-resolution picture.
+# No method reads farther: gather's low-resolution image.
 FAR = 0.8 * MAX_COC + 10
 
 

@@ -43,14 +43,14 @@ def hidden_share(radius):
 
 
 def half_plane(near, near_depth, far, far_depth):
-    """Picture, depth, and what is behind: `near` to the left of the edge, before `far`."""
+    """Image, depth, and what is behind: `near` to the left of the edge, before `far`."""
     left = np.arange(SIZE[1]) < EDGE
     image = np.where(left[None, :, None], near, far)
     depth = np.broadcast_to(np.where(left, near_depth, far_depth), SIZE)
     return image, depth, (far, np.where(left, far_depth, np.inf) * np.ones(SIZE))
 
 
-# One compiled program for all the pictures of one size.
+# One compiled program for all the images of one size.
 @jax.jit
 def one_layer(image, depth, lens=LENS):
     return dof.layered(image, depth, lens, max_coc=12.0)
@@ -99,7 +99,7 @@ def test_the_foreground_alone_is_blurred_where_both_planes_are():
 
 
 def floor(size=SIZE):
-    """A plane through the focus whose defocus goes from -12 to 12 down the picture."""
+    """A plane through the focus whose defocus goes from -12 to 12 down the image."""
     defocus = np.linspace(12, -12, size[0])
     return np.broadcast_to((24 / (12 - defocus + 1e-9))[:, None], size)
 

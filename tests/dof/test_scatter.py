@@ -98,7 +98,7 @@ def test_kernels_agree(seed, gamma, epsilon, coc):
 
 @first("radius", [0.0, 0.3, 0.5, 0.51, 1.0, 1.49, 2.7, 7.9, 20.0, 40.0], 7)
 def test_a_point_of_light_keeps_its_energy_and_place(radius):
-    # All pixels are blurred alike, so the weights sum to 1 away from the frame and the picture
+    # All pixels are blurred alike, so the weights sum to 1 away from the frame and the image
     # of a point is its sprite.
     largest = next(each for each in (8, 20, 40) if radius <= each)
     side = 2 * largest + 5
@@ -122,7 +122,7 @@ def test_a_point_of_light_keeps_its_energy_and_place(radius):
 
 
 def largest_step(spacing):
-    """The largest change of a picture between neighbours of a sweep of the radius, 0 to 2."""
+    """The largest change of an image between neighbours of a sweep of the radius, 0 to 2."""
     image, _ = random_scene(3, 12, 12)
     depth = jnp.full((12, 12), jnp.inf)
     radii = jnp.arange(0.0, 2.0 + spacing / 2, spacing)
@@ -257,7 +257,7 @@ def picture(inputs, program, max_coc=8):
 def compiled(program, is_twice=False):
     """One program: compiling is most of the work.
 
-    The picture; the gradient of a weighted sum of it; both their derivatives along a direction,
+    The image; the gradient of a weighted sum of it; both their derivatives along a direction,
     the gradient's only if that is asked for.
     """
 

@@ -131,7 +131,7 @@ def test_an_earlier_run_is_drawn_again(out, tmp_path, monkeypatch, capsys):
     assert "28 measurements" in capsys.readouterr().out
 
 
-# Public names of the effects that make no picture by themselves: what others are made with.
+# Public names of the effects that make no image by themselves: what others are made with.
 PARTS = {
     *("Accumulation", "binomial_weights", "linear_taps", "Candidates", "Receivers"),
     *("candidates", "receivers", "light_cameras", "Choice", "Hit", "choose"),

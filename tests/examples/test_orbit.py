@@ -33,7 +33,7 @@ def test_a_mesh_gives_a_gif_and_a_sheet_with_the_truth_below(run, tmp_path):
         assert gif.n_frames == 5 and gif.size == (40, 40)
     sheet = np.asarray(Image.open(tmp_path / "made" / "orbit.png")).astype(float)
     assert sheet.shape == (80, 200, 3)
-    # In the middle nothing is turned: the picture is the rendered one.
+    # In the middle nothing is turned: the image is the rendered one.
     np.testing.assert_array_equal(sheet[:40, 80:120], sheet[40:, 80:120])
     # To the side it is nearer to the turned render than to the one from the front.
     shown, truth, front = sheet[:40, 120:160], sheet[40:, 120:160], sheet[40:, 80:120]

@@ -86,7 +86,7 @@ def test_the_search_finds_the_lens_where_camera_and_light_are_right(example, out
 
 
 def test_light_and_lens_have_true_derivatives(example, out):
-    """Against differences of the whole picture; the camera's miss silhouettes."""
+    """Against differences of the whole image; the camera's miss silhouettes."""
     mesh, stage, truth = example.set_stage(None, *SIZE)
     truth = jnp.asarray(truth)
     cast = mesh.cast(stage.light(truth))

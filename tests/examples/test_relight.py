@@ -52,7 +52,7 @@ def test_the_report_has_the_time_of_each_frame_and_is_near_fresh_caches(done):
     for frame in frames:
         assert frame["milliseconds"] == pytest.approx(sum(frame["steps"].values()))
         assert min(frame["steps"].values()) > 0
-        # A cache of four views, of a picture as coarse as its textures.
+        # A cache of four views, of an image as coarse as its textures.
         assert frame["psnr"] > 17
     assert {"depth", "synthesize", "fill", "shadow", "shade", "image"} == {*frames[-1]["steps"]}
     assert {"shadow", "edit", "image"} == {*frames[0]["steps"]}

@@ -139,7 +139,7 @@ def nuke_name(channel):
     Foundry publishes that source with its development kit. The name is cut at its first two
     dots. Leading digits and empty parts go, and what is no letter or digit becomes `_`. The
     last part is the channel, r, g, b and a spelt out; the others are its layer, where `Ci` is
-    the main picture's.
+    the main image's.
     """
     parts = [re.sub(r"^[0-9]+", "", part) for part in channel.split(".", 2)]
     *layers, last = [re.sub("[^a-zA-Z0-9]", "_", part) for part in parts if part] or ["unnamed"]

@@ -355,7 +355,7 @@ def test_gain_and_offset_are_found_beside_the_lens():
     assert found(fitted) == pytest.approx(TRUTH, rel=0.01)
     np.testing.assert_allclose(fitted.gain, gain[None], rtol=0.01)
     np.testing.assert_allclose(fitted.offset, offset[None], atol=0.01)
-    # The picture is the method's own.
+    # The image is the method's own.
     np.testing.assert_allclose(fitted.image, reference, atol=0.02)
 
 
@@ -410,6 +410,6 @@ def test_several_images_determine_one_aperture():
     np.testing.assert_allclose(foci, (2.5, 4.0), rtol=0.02)
     np.testing.assert_allclose([lens.aperture for lens in fitted.lenses], 0.12, rtol=0.02)
     assert fitted.standard_errors["focus_distance"].shape == (2,)
-    # One aperture for both: the second picture's error is the first's.
+    # One aperture for both: the second image's error is the first's.
     errors = fitted.standard_errors["aperture"]
     assert float(errors[0]) == pytest.approx(float(errors[1]))

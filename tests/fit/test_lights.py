@@ -1,4 +1,4 @@
-"""The fit of lights: what lit a picture is found in it; what can't be told apart is said."""
+"""The fit of lights: what lit an image is found in it; what can't be told apart is said."""
 
 import functools
 import inspect

@@ -1,4 +1,4 @@
-"""Several sources in one picture, and the choice among them."""
+"""Several sources in one image, and the choice among them."""
 
 import inspect
 import re

@@ -131,7 +131,7 @@ def surface():
 
 
 def with_hole(hole, kind):
-    """A picture and its depth with one hole, with a block, or with one known pixel."""
+    """An image and its depth with one hole, with a block, or with one known pixel."""
     image, depth = surface()
     if kind == "one":
         depth[5, 7] = hole

@@ -1,4 +1,4 @@
-"""Pictures from other cameras, against cameras, planes and meshes whose view is known."""
+"""Images from other cameras, against cameras, planes and meshes whose view is known."""
 
 import inspect
 import re
@@ -36,7 +36,7 @@ def test_the_same_camera_gives_the_same_picture(method):
 
 @first("move", [(0.3, 0.1, 0.0), (0.0, 0.0, 0.5), (0.0, 0.0, -0.5)])
 def test_a_plane_moves_by_its_homography(move):
-    """A linear picture of a fronto-parallel plane, read where the plane's points project to."""
+    """A linear image of a fronto-parallel plane, read where the plane's points project to."""
     y, x = np.mgrid[:24, :32] + 0.5
     image, depth = np.stack([x, y], axis=-1), np.full((24, 32), 2.0)
     source, target = camera(), camera(at=move)

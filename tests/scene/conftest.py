@@ -83,7 +83,7 @@ def rays():
 def straight():
     """An orthographic camera whose image is [0, width] x [0, height] of the plane z = 0.
 
-    A pixel is a scene unit; y points up in the world and down in the picture.
+    A pixel is a scene unit; y points up in the world and down in the image.
     """
 
     def make(height, scale=1.0):

@@ -5,10 +5,11 @@ along the rows then paints them all. The cost is pixels times rows, not pixels t
 
 An end that cuts a pixel at the fraction f adds `(1 - f)` of the step there and `f` in the next
 pixel. With A the sum of all steps at the pixels that are cut, and B that of f times the step,
-the picture is `running_sum(A) - B`: one place to write for both.
+the image is `running_sum(A) - B`: one place to write for both.
 
 Discs are taken a block at a time, whose steps stay in the cache, out to the block's own largest
-radius. A running sum begins anew with each block, so that what it rounds stays near its source.
+radius. A running sum begins again with each block, so that what it rounds stays near its
+source.
 
 What it does not do well: scattered writes use one core.
 """
@@ -117,7 +118,7 @@ def read_back(
 
 
 class _Blocks:
-    """How a picture is divided, and where in a block's window the ends of its spans lie.
+    """How an image is divided, and where in a block's window the ends of its spans lie.
 
     A window is the block and `reach` pixels about it, and one more column on either side, as
     rounding may carry an end that far. Below it lies one row that nobody reads.

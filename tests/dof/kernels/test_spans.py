@@ -100,7 +100,7 @@ def test_highlights_leave_dim_pixels_alone(bright, share):
 @first("program", PROGRAMS)
 @pytest.mark.full
 def test_the_order_of_pixels_is_irrelevant(program):
-    # The picture of all is the sum of the pictures of any parts, taken in any order.
+    # The image of all is the sum of the images of any parts, taken in any order.
     given = sprites(7, (33, 41), 30.0)
     part = np.random.default_rng(8).integers(0, 3, given.radius.shape)
     only = lambda k: given._replace(value=jnp.where((part == k)[..., None], given.value, 0))
