@@ -19,6 +19,7 @@ from jaxfx.dof.gather import mix
 from jaxfx.lens import Lens
 
 
+# Taps beside the centre, as in the source. More smooth the pattern that large radii show.
 _TAPS = 12
 
 
@@ -80,7 +81,7 @@ def _blend(image, depth, lens, max_coc):
     view = defocused(image, depth, lens, max_coc)
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
     kernel = taps_kernel(max_coc / 2 / math.sqrt(2))
-    # Pixels without a depth are left out; the last channel is how much is left.
+    # Pixels whose depth is missing are left out; the last channel is the weight that is left.
     planes = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
     planes = jnp.where(view.missing[..., None], 0, planes)
     planes = _filter(_filter(planes, kernel), kernel)
@@ -106,7 +107,7 @@ def taps_kernel(radius: float) -> Float[np.ndarray, "side side"]:
 def _filter(
     image: Float[Array, "height width channel"], kernel: Float[np.ndarray, "side side"]
 ) -> Float[Array, "height width channel"]:
-    """`image` under a small sparse kernel, the frame's own pixels repeated beyond it."""
+    """`image` filtered by a small sparse kernel; its last pixels go on beyond the frame."""
     reach = len(kernel) // 2
 
     def push(image: Array) -> Array:
@@ -126,7 +127,7 @@ def _margin(pixels: int) -> tuple[tuple[int, int], ...]:
 def _sums(
     wide: Float[Array, "H W channel"], kernel: Float[np.ndarray, "side side"]
 ) -> Float[Array, "height width channel"]:
-    """The sums under the kernel wherever it fits in."""
+    """The sums under the kernel at every place where it fits into `wide`."""
     height, width = (size - len(kernel) + 1 for size in wide.shape[:2])
     channels = wide.shape[2]
     rows = wide.reshape(len(wide), -1)  # pixels and channels as one long axis

@@ -17,7 +17,7 @@ from jaxfx.dof.sprites import POINT_RADIUS, coverage, reach, row_half_width
 from jaxfx.lens import Lens
 
 
-# Coverage below this is none.
+# Opacity below this counts as 0: guards a quotient.
 _LEAST = 1e-12
 
 
@@ -116,7 +116,7 @@ def _in_slices(
     far: int,
     slices: int,
 ) -> Float[Array, "height width value"]:
-    """The visible sums, slice by slice; `place` is where a sprite lies, -1 to 1."""
+    """The visible sums, slice by slice; `place` is the defocus over `max_coc`, -1 to 1."""
     place = (place + 1) / 2 * (slices - 1)
 
     def add_slice(carry, index):
@@ -142,7 +142,7 @@ def _in_order(
     depth: Float[Array, "height width"],
     far: int,
 ) -> Float[Array, "height width value"]:
-    """The visible sums, every sprite at its own depth."""
+    """The visible sums, with every sprite at its own depth: the oracle."""
     height, width = radius.shape
     side = jnp.arange(-far, far + 1)
     rows, columns = (x.reshape(-1) for x in jnp.meshgrid(side, side))

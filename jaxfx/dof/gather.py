@@ -1,4 +1,4 @@
-"""Depth of field by a few taps a pixel, some of them from a low-resolution image."""
+"""Depth of field by a few taps per pixel, mixed from the image and a low-resolution one."""
 
 import functools as ft
 
@@ -78,9 +78,6 @@ def gather(
     - weighted by 1 if the tap lies behind q, and by its own b if it lies in front: so that a
       surface in focus does not leak onto what is behind it.
 
-    A pixel gathers over its own circle, not over those that reach it: a blurred foreground
-    keeps a hard rim before a background in focus. Eight taps are too few beyond some 10 pixels.
-
     Source: Scheuermann 2004, advanced depth of field: the low-resolution image, the taps, the
     scales and the leak test. Reconstructed: the border of an image whose sides are no multiples
     of 4 (its last row and column are repeated). Our own: the Vogel spiral, `ramp`, and that
@@ -96,22 +93,23 @@ def gather(
 
 @ft.partial(jax.jit, static_argnames=("max_coc", "disc"))
 def _gather(image, depth, lens, ramp, max_coc, disc):
-    return _picture(image, depth, lens, ramp, max_coc, disc)
+    return _gathered(image, depth, lens, ramp, max_coc, disc)
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(4, 5))
-def _picture(image, depth, lens, ramp, max_coc, disc):
-    """An accelerator takes as long to count as to add a tap: there, two of them at a time.
+def _gathered(image, depth, lens, ramp, max_coc, disc):
+    """The result; on an accelerator, where a turn costs a launch, by two taps per turn.
 
-    The derivatives would hold more than 40 images in memory, if they did so.
+    Derivatives take one tap per turn everywhere: with two they need more than 40 images of
+    memory.
     """
     single = ft.partial(_drawn, max_coc=max_coc, disc=disc)
     pairs = ft.partial(single, at_once=2)
     return by_platform(image, depth, lens, ramp, cpu=single, accelerator=pairs)
 
 
-@_picture.defjvp
-def _picture_jvp(max_coc, disc, primals, tangents):
+@_gathered.defjvp
+def _gathered_jvp(max_coc, disc, primals, tangents):
     return jax.jvp(ft.partial(_drawn, max_coc=max_coc, disc=disc), primals, tangents)
 
 
@@ -119,9 +117,9 @@ def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
     dtype = image.dtype
     view = defocused(image, depth, lens, max_coc)
     ramp = ramp.astype(view.image.dtype)
-    # What is bad is told by its colour, also in the low-resolution image.
+    # A bad pixel is NaN, so that whatever reads it is, in the low-resolution image too.
     image = jnp.where(view.bad[..., None], jnp.nan, view.image)
-    # One read gives a tap's colour, its defocus and how much of it has a depth.
+    # One read gives a tap's colour, its defocus and the share of it whose depth is known.
     planes = [image, view.defocus[..., None], jnp.ones_like(image[..., :1])]
     full = jnp.where(view.missing[..., None], 0, jnp.concatenate(planes, axis=-1))
     low = low_resolution(jnp.concatenate([full[..., :-2], full[..., -1:]], axis=-1))
@@ -139,7 +137,7 @@ def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
         tap, defocus = mean[..., :-1], mean[..., -1]
         blur = absolute(defocus) / max_coc
         soft = bilinear(low, points / _SIDE + _LOW_RADIUS * offset)
-        # Where the low-resolution image knows nothing, the tap stands for itself.
+        # Where the low-resolution image has no pixel of known depth, the tap alone counts.
         share = jnp.where(soft[..., -1] > 0, blur, 0)
         tap = mix(tap, _mean(soft), share[..., None])
         behind = (defocus >= centre - rounding).astype(image.dtype)
@@ -168,7 +166,7 @@ def mix(
     other: Float[Array, "height width channel"],
     share: Float[Array, "height width 1"],
 ) -> Float[Array, "height width channel"]:
-    """`one` and a share of `other`; what is no number and has no share spoils nothing."""
+    """`one` blended with a share of `other`; a NaN whose share is 0 has no effect."""
     outside = (share == 0) & ~jnp.isfinite(other)
     return (1 - share) * one + share * jnp.where(outside, 0, other)
 

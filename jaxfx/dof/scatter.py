@@ -36,9 +36,10 @@ _SECONDS: dict[Any, tuple[float, float, float, float]] = {
     "spans": (0.02, 80.0, 6.0, 0.0),
 }
 
-# Visibility stays below e**60, so that its sums with highlights are finite in float32.
+# Largest logarithm of an amplification: sums with highlights stay finite in float32.
 _LOG_VISIBILITY = 60.0
-# An epsilon below this is this: no two circles of confusion of an image lie so near.
+# Least epsilon, in pixels: no two circles of confusion of an image are so near. Guards a
+# quotient.
 _SMALLEST_EPSILON = 1e-6
 
 
@@ -170,7 +171,7 @@ def to_sprites(
     value = jnp.where(missing[..., None], 0, value)
     epsilon = jnp.maximum(epsilon.astype(dtype), _SMALLEST_EPSILON)
     leak = jnp.where(foreground, -1, coc)
-    # What leaks onto a pixel of unknown depth is not known: all of it is taken.
+    # Onto a pixel whose depth is missing everything leaks: which part should is not known.
     return Sprites(value, radius, leak, jnp.where(missing, max_coc, coc), epsilon)
 
 
@@ -178,7 +179,7 @@ def to_sprites(
 def _in_or_out_of_focus(
     image, depth, lens, gamma, epsilon, missing, max_coc, programs, coverage
 ):
-    """An image wholly in focus is itself; its derivative is computed like any other."""
+    """The blurred image; an image wholly in focus is returned as it is, without the sums."""
     blurred = ft.partial(_blurred, max_coc=max_coc, programs=programs, coverage=coverage)
 
     def is_sharp(_, depth, lens, *__):
@@ -195,10 +196,10 @@ def _in_or_out_of_focus_jvp(max_coc, programs, coverage, primals, tangents):
 
 
 def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, programs, coverage):
-    """The quotient of the two sums, for finite pixels."""
-    # Rematerialised: a reverse pass keeps the sprites, not the twenty planes they are made of.
-    made = jax.checkpoint(to_sprites, static_argnums=5)
-    sprites = made(image, depth, lens, gamma, epsilon, max_coc, missing)
+    """The sums of colours over the sums of weights, for finite pixels."""
+    # Rematerialised: a reverse pass keeps the sprites, not the twenty planes behind them.
+    rematerialised = jax.checkpoint(to_sprites, static_argnums=5)
+    sprites = rematerialised(image, depth, lens, gamma, epsilon, max_coc, missing)
     if "segment_sum" in programs:
         sums = segment_sum(sprites, reach(max_coc), coverage)
     else:
@@ -217,7 +218,7 @@ def _program(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
 def _quotient(
     sums: Float[Array, "height width value"],
 ) -> Float[Array, "height width channel"]:
-    """The channels over the weight. As the rule states it, a weight is never squared."""
+    """The channels over the weight; its derivative squares no weight, which could underflow."""
     return sums[..., :-1] / sums[..., -1:]
 
 

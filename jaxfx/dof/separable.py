@@ -18,11 +18,12 @@ from jaxfx.lens import Lens
 
 # Half the side of a square over the diameter of the disc that has its variance.
 _HALF_SIDE = math.sqrt(3) / 4
-# An epsilon below this is this.
+# Least epsilon, in pixels: no two circles of confusion of an image are so near. Guards a
+# quotient.
 _SMALLEST_EPSILON = 1e-6
-# Rows that are passed over at once: what a tap reads and adds to then stays in the cache.
+# Rows filtered at once on a CPU: what a tap reads and adds to then stays in the cache.
 _BAND = 16
-# Taps that an accelerator adds in one launch: more take longer to compile.
+# Taps per launch on an accelerator: more take longer to compile, fewer cost launches.
 _TOGETHER = 6
 
 
@@ -100,16 +101,16 @@ def _separable(image, depth, lens, epsilon, max_coc):
     epsilon = jnp.maximum(epsilon.astype(coc.dtype), _SMALLEST_EPSILON)
     far = reach(2 * _HALF_SIDE * max_coc)
 
-    picture = jnp.moveaxis(jnp.where(view.bad[..., None], jnp.nan, view.image), -1, 0)
-    # What leaks onto a pixel of unknown depth is not known: all of it is taken.
+    channels = jnp.moveaxis(jnp.where(view.bad[..., None], jnp.nan, view.image), -1, 0)
+    # Onto a pixel whose depth is missing everything leaks: which part should is not known.
     coc = jnp.where(view.missing, max_coc, coc)
-    planes = picture, half, leak, coc, jnp.where(view.missing, 0, jnp.ones_like(coc))
+    planes = channels, half, leak, coc, jnp.where(view.missing, 0, jnp.ones_like(coc))
     in_bands = ft.partial(_in_bands, far=far)
     at_once = ft.partial(_along_rows, far=far, together=_TOGETHER)
     for _ in range(2):
-        # Turned over after each pass: the second is along columns.
-        picture = by_platform(planes, epsilon, cpu=in_bands, accelerator=at_once)
-        planes = tuple(plane.swapaxes(-1, -2) for plane in (picture, *planes[1:]))
+        # Transposed after each pass: the second is along columns.
+        channels = by_platform(planes, epsilon, cpu=in_bands, accelerator=at_once)
+        planes = tuple(plane.swapaxes(-1, -2) for plane in (channels, *planes[1:]))
     result = jnp.moveaxis(planes[0], 0, -1)
     return jnp.where(view.lost[..., None], jnp.nan, result).astype(image.dtype)
 
@@ -117,7 +118,7 @@ def _separable(image, depth, lens, epsilon, max_coc):
 def _in_bands(
     planes: tuple[Float[Array, "..."], ...], epsilon: Float[Array, ""], far: int
 ) -> Float[Array, "channel height width"]:
-    """One pass, a band of rows after another."""
+    """One pass along rows, a band of rows at a time."""
     height = planes[1].shape[0]
     band = min(_BAND, height)
 
@@ -138,18 +139,18 @@ def _in_bands(
 def _along_rows(
     planes: tuple[Float[Array, "..."], ...], epsilon: Float[Array, ""], far: int, together: int
 ) -> Float[Array, "channel height width"]:
-    """One pass: the mean of the pixels of a row whose segments reach each of its pixels.
+    """One pass: per pixel the weighted mean of the pixels of its row whose segments reach it.
 
-    Those that are not `known` have none, and a little weight for themselves. So many taps are
-    added `together`, in one launch of an accelerator.
+    A pixel whose depth is missing has no segment, and a small weight on its own colour.
+    `together` is how many taps are added per turn of the loop: one launch of an accelerator.
     """
     image, half, leak, coc, known = planes
     width, count = coc.shape[1], -(-(2 * far + 1) // together) * together
 
     def pad(x, fill):
-        # Beyond the last offset there are as many more as fill the last group: no weight.
-        room = [(0, 0)] * (x.ndim - 1) + [(count - far - 1, far)]
-        return jnp.pad(x, room, constant_values=fill)
+        # The offsets that only fill up the last group have no weight.
+        margins = [(0, 0)] * (x.ndim - 1) + [(count - far - 1, far)]
+        return jnp.pad(x, margins, constant_values=fill)
 
     padded = pad(image, 0), pad(half, POINT_RADIUS), pad(leak, -1)
     counts = pad(known, 0)
@@ -162,7 +163,7 @@ def _along_rows(
         color, half, leak = map(seen, padded)
         weight = seen(counts) * coverage(half, column) / (2 * half)
         weight = weight * leak_rejection(leak, coc, epsilon)
-        # What has no share is not looked at: it may be no number.
+        # A colour without weight may be NaN.
         part = weight[None] * jnp.where(weight[None] == 0, 0, color)
         return sums[0] + part, sums[1] + weight
 

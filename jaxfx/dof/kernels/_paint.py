@@ -11,7 +11,7 @@ Discs are taken a block at a time, whose steps stay in the cache, out to the blo
 radius. A running sum begins again with each block, so that what it rounds stays near its
 source.
 
-What it does not do well: scattered writes use one core.
+What it does not do well: XLA writes scattered values on one core.
 """
 
 import math
@@ -25,7 +25,8 @@ from jaxtyping import Array, Float, Int
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
-# Enough discs to spread a row's overhead; their steps fill a megabyte at a radius of 64.
+# Height and width of a block in pixels: enough discs to spread the overhead of a row; their
+# steps fill a megabyte at a radius of 64. Larger blocks do not fit into a core's cache.
 BLOCK = (32, 128)
 
 
@@ -35,7 +36,7 @@ def paint(
     radius: Float[Array, "height width"],
     dot: tuple[Float[Array, "value height width"], Float[Array, "height width"]] | None = None,
 ) -> Float[Array, "value height width"]:
-    """The sum of all discs, each its value times its coverage; where `radius` is 0 is none.
+    """The sum of all discs, each its value times its coverage; a radius of 0 is no disc.
 
     Given `dot`, tangents of value and radius, the derivative of that along them.
     """
@@ -83,7 +84,7 @@ def read_back(
 ) -> tuple[Float[Array, "value height width"], Float[Array, "height width"]]:
     """The adjoint of `paint`, times `weight`, at `bar`, added to `bars`, of value and radius.
 
-    Each step is read where it was written: A from the sums to come, B as it is.
+    It reads each step where `paint` writes it: A as the sum of what comes later, B as it is.
     """
     blocks = _Blocks(reach, radius)
     values = len(value)
