@@ -23,7 +23,8 @@ Sampling = Literal["discrete", "linear"]
 # A pass is a sum over taps, the arrays that `tap(i)` gives; they differ in their offset only.
 Tap = Callable[[int], Array]
 
-# So many terms are added at once; a term reads two taps.
+# Terms per sum; a term reads two taps. Of more than 16 shifted reads in one sum XLA makes as
+# many copies of the image.
 _GROUP = 8
 
 
@@ -170,7 +171,7 @@ def _columns(
 
 
 def linear_reads(weights: Float[Array, "taps"]) -> list[tuple[int, Array, Array]]:
-    """What linear sampling reads: the first tap, the second's share, and the weight of both.
+    """Reads of linear sampling: the first tap, the second's share, and the weight of both.
 
     The first tap is static. A read of one tap alone has a share of 0.
     """

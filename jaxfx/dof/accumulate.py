@@ -17,7 +17,7 @@ from jaxfx.lens import ThinLens
 
 
 class Accumulation(NamedTuple):
-    """What `accumulate` gives.
+    """The result of `accumulate`.
 
     - `image`: height width channel, the mean of all passes, linear radiance.
     - `convergence`: the root-mean-square difference between the mean of the first half of the
@@ -100,7 +100,7 @@ def accumulate(
         image = image.astype(working_dtype(dtype))
         if total is not None and image.shape != total.shape:
             raise ValueError(
-                "`accumulate(render)` must give pictures of one shape, got "
+                "`accumulate(render)` must give images of one shape, got "
                 f"{total.shape}, then {image.shape}."
             )
         total = image if total is None else total + image

@@ -123,7 +123,7 @@ def layered(
 def _second_layer(
     image: Array, depth: Array, lens: Any, behind: Any
 ) -> tuple[Array, Array, Any]:
-    """The second layer's image, its depth and the lens for it; `ValueError` names a fault."""
+    """The second layer's image, its depth and the lens for it; `ValueError` if it is none."""
     name = "layered(behind=...)"
     pair = items(name, behind, "a pair of an image and its depth")
     if len(pair) != 2:

@@ -28,7 +28,7 @@ Coverage = Literal["area", "indicator"]
 
 _PROGRAMS = {"shift": SHIFTS, "tiles": TILES, "spans": SPANS, "rows": ROWS}
 
-# For `cheapest`: seconds, and nanoseconds a pixel, a pixel's row, a tap that is computed, as
+# For `cheapest`: seconds, and nanoseconds per pixel, per row of a pixel, per computed tap, as
 # measured on two cores.
 _SECONDS: dict[Any, tuple[float, float, float, float]] = {
     "shift": (0.0, 40.0, 0.0, 1.5),

@@ -1,4 +1,4 @@
-"""What every scatter kernel shares: the sprite of a pixel and its exact coverage."""
+"""The sprite of a pixel and its exact coverage, for every kernel, `fit` and `budget`."""
 
 import functools as ft
 import math
@@ -86,7 +86,7 @@ def _segment_polynomial(degree: int) -> tuple[float, ...]:
     `area(s)` is the integral of `sqrt(1 - t**2)` from 0 to s. With `t = 1 - x v` the rest,
     up to 1, is `x**1.5` times the integral of `sqrt(v) sqrt(2 - x v)` over v in [0, 1], whose
     binomial series is summed at the nodes of a Chebyshev fit. The nearest branch point is at
-    x = 2, so that the fit's error falls by a factor of 5.8 a degree.
+    x = 2, so that the fit's error falls by a factor of 5.8 per degree.
     """
     nodes = (1 - np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree))) / 2
     term, values = np.full_like(nodes, math.sqrt(2)), np.zeros_like(nodes)

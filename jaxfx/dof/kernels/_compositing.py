@@ -19,12 +19,14 @@ from jaxfx._numerics import sum_planes
 from jaxfx.dof.kernels._slices import Extent, Sheets
 
 
-# A slice after all others.
+# Number of a slice behind all others: the lens is not filled yet.
 _NEVER = 2**30
-# A lens is full to so many units of rounding.
+# Units of rounding (machine epsilons): an aperture covered to within this many counts as full.
+# Without them a sum of shares that rounds to just below 1 would let a sliver through.
 _ROUNDING = 32
-# The weight of a contribution in the fallback colour: this where nothing has been accumulated,
-# rising linearly to 1 more where the aperture is covered.
+# Weight of a contribution in the fallback colour where nothing has been accumulated; it rises
+# linearly by 1 to where the aperture is covered. Chosen on the still life. With 0 a pixel that
+# only its first slice reaches has no fallback colour; larger, and the foreground bleeds.
 _FIRST = 0.1
 
 Stack = Float[Array, "value height width"]
@@ -86,7 +88,7 @@ def allowance(
 
 
 class Reading(NamedTuple):
-    """What the adjoint knows of each pixel before it comes to the slices.
+    """Values per pixel that the adjoint reads at every slice.
 
     `bar` and `late_bar` are the cotangents of light and of the weighted light; `worth` is what
     the slice that filled the lens would give for a unit of it, and `weight` that slice's in the

@@ -66,7 +66,7 @@ def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
     total = 2 * slices + 1
     count = -(-total // GROUP)
     bounds = [round(k * total / count) - slices for k in range(count + 1)]
-    # A slice is at most so many pixels of radius thick.
+    # Largest thickness of a slice, in pixels of radius.
     thick = extent.max_coc / 2 / max(slices - 1, 1)
     runs = []
     for low, high in itertools.pairwise(bounds):
@@ -106,7 +106,7 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
 def _arriving(
     extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
 ) -> list[Float[Array, "value height width"]]:
-    """What the sprites of each slice of a group sum to at each pixel of the frame."""
+    """Sums of the sprites of each slice of a group, per pixel of the frame."""
     far, across = extent.reach, across_of(reach)
     height, width = (n - 2 * far for n in sheet.radius.shape)
     wider = max(0, across - far)

@@ -34,7 +34,7 @@ from jaxfx.dof.sprites import POINT_RADIUS, row_half_width
 
 
 def composited(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
-    """What fills the lens of each pixel of the frame: light and, last, how much it fills.
+    """Light per pixel of the frame and, last, the share of the aperture that it covers.
 
     Then the same once more, each part of it weighted by how much was filled when it arrived.
     """

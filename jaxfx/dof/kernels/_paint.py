@@ -226,5 +226,5 @@ def _read(steps: Array, cell: Array) -> Array:
 
 
 def _flat(x: Float[Array, "... tall wide"]) -> Float[Array, "disc value"]:
-    """One row a disc."""
+    """One row per disc."""
     return x.reshape(-1, x.shape[-2] * x.shape[-1]).T

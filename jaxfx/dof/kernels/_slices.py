@@ -103,7 +103,7 @@ def share_slope_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def _begun(
     value: Float[Array, "disc value"],
 ) -> tuple[Float[Array, "disc step"], Float[Array, "disc step"]]:
-    """What the start of a span adds to the running steps, and to the pixel that it cuts."""
+    """Steps at the start of a span: of the running sum, and of the pixel that it cuts."""
     nothing = jnp.zeros_like(value)
     return jnp.concatenate([value, nothing], axis=1), jnp.concatenate([nothing, value], axis=1)
 

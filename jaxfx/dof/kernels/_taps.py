@@ -22,7 +22,7 @@ class Sweep(NamedTuple):
     the offset and `slope`, given where `slopes` are asked for, the derivative of that in its
     radius.
 
-    `clip` clamps to [0, 1], in the way that its compiler likes.
+    `clip` clamps to [0, 1], in the form that compiles best for the sweep's device.
     """
 
     sums: Callable[..., list[Array]]

@@ -32,7 +32,7 @@ from jaxfx.dof.sprites import POINT_RADIUS, Sprites, segment_integral
 
 # Tall enough to spread a row's overhead, wide for the vector units, small enough for the cache.
 TILE = (64, 128)
-# A run of fewer than 17 taps takes XLA three times as long a tap: it reads every one through a
+# A run of fewer than 17 taps takes XLA three times as long per tap: it reads each one through a
 # dynamic slice, which it lays out in memory for more readers than 16. The middle run is the one
 # of the 8 offsets to either side.
 RUN, NEAR = 17, 8
@@ -199,7 +199,7 @@ def farthest(reach: int) -> int:
 
 
 def _runs(reach: Int[Array, ""], row: Int[Array, ""]) -> Int[Array, ""]:
-    """How many runs beyond the middle one a disc of that reach covers in a row, to a side."""
+    """How many runs beyond the middle one a disc of that reach covers in a row, per side."""
     radius = reach.astype(jnp.float32) + POINT_RADIUS
     height = jnp.maximum(row.astype(jnp.float32) - 0.5, 0)
     half_chord = jnp.sqrt(jnp.maximum((radius - height) * (radius + height), 0))
