@@ -25,7 +25,7 @@ _NEVER = 2**30
 # Without them a sum of shares that rounds to just below 1 would let a sliver through.
 _ROUNDING = 32
 # Weight of a contribution in the fallback colour where nothing has been accumulated; it rises
-# linearly by 1 to where the aperture is covered. Chosen on the still life. With 0 a pixel that
+# linearly by 1 to where the aperture is covered. With 0 a pixel that
 # only its first slice reaches has no fallback colour; larger, and the foreground bleeds.
 _FIRST = 0.1
 
