@@ -103,6 +103,20 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
     return state
 
 
+def _each_column(add: Callable[..., Any], sums: Array, across: int) -> Array:
+    """`sums` after `add(sums, column)` for all columns from `-across` to `across`.
+
+    As a scan, it is traced once; unrolled where it is lowered, all taps are one kernel.
+    """
+    columns = jnp.arange(-across, across + 1)
+    return jax.lax.scan(add, sums, columns, unroll=2 * across + 1)[0]
+
+
+def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> Array:
+    """`size` columns from `start` on, which lie inside."""
+    return jax.lax.dynamic_slice_in_dim(x, start, size, axis=-1, allow_negative_indices=False)
+
+
 def _arriving(
     extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
 ) -> list[Float[Array, "value height width"]]:
@@ -129,14 +143,15 @@ def _arriving(
         moved = slant * span * span / 3
         start, end, facing = moved - span, moved + span, 1 + turned * row.astype(own.dtype)
         start, end, facing = jax.lax.optimization_barrier((start, end, facing))
-        for column in range(-across, across + 1):
-            low = far + wider - column
-            there = lambda x, low=low: jax.lax.slice_in_dim(x, low, low + width, axis=-1)
-            edge = 0.5 - column
+
+        def add_tap(sums, column):
+            there = ft.partial(_columns, start=far + wider - column, size=width)
+            edge = 0.5 - column.astype(own.dtype)
             cover = (clip01(there(end) + edge) - clip01(there(start) + edge)) * there(facing)
             shares = cover[None] * share_of(there(places)[None] - slices)
-            sums = sums + shares[:, None] * there(light)[None]
-        return sums
+            return sums + shares[:, None] * there(light)[None], None
+
+        return _each_column(add_tap, sums, across)
 
     # Made here, or those of all groups would be made at once.
     value, zero = jax.lax.optimization_barrier((value, jnp.zeros((), value.dtype)))
@@ -221,13 +236,14 @@ def _read_back(
         by_tilt = span * span / 3
         start, end = tilt_x * by_tilt - span, tilt_x * by_tilt + span
         start, end = jax.lax.optimization_barrier((start, end))
-        read = jnp.zeros((len(bar), *value.shape), value.dtype)
-        for column in range(-across, across + 1):
-            low, edge = across + column, 0.5 - column
+
+        def add_tap(read, column):
+            edge = 0.5 - column.astype(value.dtype)
             cover = clip01(end + edge) - clip01(start + edge)
-            read = read + cover[None, None] * jax.lax.slice_in_dim(
-                planes, low, low + columns, axis=-1
-            )
+            there = _columns(planes, start=across + column, size=columns)
+            return read + cover[None, None] * there, None
+
+        read = _each_column(add_tap, jnp.zeros((len(bar), *value.shape), value.dtype), across)
         read = jax.lax.optimization_barrier(read)
 
         def over_slices(weights, read):
