@@ -117,9 +117,11 @@ def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> 
     return jax.lax.dynamic_slice_in_dim(x, start, size, axis=-1, allow_negative_indices=False)
 
 
+# Compiled: groups of one size and reach, before and behind the focus, are traced once.
+@ft.partial(jax.jit, static_argnames=("extent", "count", "reach"))
 def _arriving(
     extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
-) -> list[Float[Array, "value height width"]]:
+) -> Float[Array, "slice value height width"]:
     """Sums of the sprites of each slice of a group, per pixel of the frame."""
     far, across = extent.reach, across_of(reach)
     height, width = (n - 2 * far for n in sheet.radius.shape)
@@ -156,7 +158,7 @@ def _arriving(
     # Made here, or those of all groups would be made at once.
     value, zero = jax.lax.optimization_barrier((value, jnp.zeros((), value.dtype)))
     nothing = jnp.broadcast_to(zero, (count, len(value), height, width))
-    return [*jax.lax.fori_loop(0, 2 * reach + 1, turn, nothing)]
+    return jax.lax.fori_loop(0, 2 * reach + 1, turn, nothing)
 
 
 def _away(
@@ -169,9 +171,10 @@ def _away(
 
 def _filled(extent: Extent, sheets: Sheets) -> Filling:
     def add(sheet, number, first, count, reach, state):
-        for k, arriving in enumerate(_arriving(extent, sheet, first, count, reach)):
-            state = fill(number * APART + first + k, arriving, state)
-        return state
+        indices = number * APART + first + jnp.arange(count)
+        arriving = _arriving(extent, sheet, first, count, reach)
+        add_slice = lambda state, slice_: (fill(*slice_, state), None)
+        return jax.lax.scan(add_slice, state, (indices, arriving), unroll=count)[0]
 
     return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
 
@@ -197,10 +200,14 @@ def adjoint(
 
     def read(sheet, number, first, count, reach, state):
         bars, carry = state
-        bar = []
-        for k, arriving in enumerate(_arriving(extent, sheet, first, count, reach)):
-            seen, carry = read_slice(reading, number * APART + first + k, arriving, carry)
-            bar.append(seen)
+        indices = number * APART + first + jnp.arange(count)
+        arriving = _arriving(extent, sheet, first, count, reach)
+
+        def read_next(carry, slice_):
+            seen, carry = read_slice(reading, *slice_, carry)
+            return carry, seen
+
+        carry, bar = jax.lax.scan(read_next, carry, (indices, arriving), unroll=count)
         found = _read_back(extent, sheet, first, reach, bar)
         bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
         return bars, carry
@@ -209,21 +216,22 @@ def adjoint(
     return _each_group(extent, sheets, read, state)[0]
 
 
+@ft.partial(jax.jit, static_argnames=("extent", "reach"))
 def _read_back(
     extent: Extent,
     sheet: Sheets,
     first: Int[Array, ""],
     reach: int,
-    bar: list[Float[Array, "value height width"]],
+    bar: Float[Array, "slice value height width"],
 ) -> Sheets:
-    """The adjoint of `_arriving` at `bar`, one stack for each slice of the group."""
+    """The adjoint of `_arriving` at `bar`."""
     far, across = extent.reach, across_of(reach)
     rows, columns = sheet.radius.shape
     away = _away(sheet, first, len(bar))
     value, (tilt_x, tilt_y) = sheet.value, sheet.tilt
     shares, slopes = share_of(away), share_slope_of(away)
     pad = [(0, 0), (0, 0), (far + reach, far + reach), (far + across, far + across)]
-    seen = jnp.pad(jnp.stack(bar), pad)
+    seen = jnp.pad(bar, pad)
     column_of = jnp.arange(columns)[None] + across
 
     def turn(index, sums):
