@@ -150,7 +150,7 @@ def comparisons(method):
     I + B F^2, with one I more for the mask by depth; and their share of `pcf`'s, I F^2."""
     mask, size = COUNTED[method]
     shadow_map, fields = two_discs(size)
-    found = shadow.candidates(shadow_map, shadow.Receivers(*fields), size=size, edges=edges)
+    found = shadow.candidates(shadow_map, shadow.Receivers(*fields), size=size, edges=mask)
     where = np.asarray(found.where)
     expected = (2 if mask == "depth" else 1) * where.size + where.sum() * size**2
     off = abs(int(found.comparisons) - int(expected))

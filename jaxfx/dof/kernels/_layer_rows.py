@@ -173,7 +173,7 @@ def _filled(extent: Extent, sheets: Sheets) -> Filling:
     def add(sheet, number, first, count, reach, state):
         indices = number * APART + first + jnp.arange(count)
         arriving = _arriving(extent, sheet, first, count, reach)
-        add_slice = lambda state, slice_: (fill(*slice_, state), None)
+        add_slice = lambda state, each: (fill(each[0], each[1], state), None)
         return jax.lax.scan(add_slice, state, (indices, arriving), unroll=count)[0]
 
     return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
@@ -203,8 +203,8 @@ def adjoint(
         indices = number * APART + first + jnp.arange(count)
         arriving = _arriving(extent, sheet, first, count, reach)
 
-        def read_next(carry, slice_):
-            seen, carry = read_slice(reading, *slice_, carry)
+        def read_next(carry, each):
+            seen, carry = read_slice(reading, each[0], each[1], carry)
             return carry, seen
 
         carry, bar = jax.lax.scan(read_next, carry, (indices, arriving), unroll=count)
