@@ -327,7 +327,9 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
             f"`{name}` must be of shape (height, width), none of them 0, got {array.shape}. "
             "Batches are made with `jax.vmap`."
         )
-    dtype = jnp.result_type(float) if is_integer else working_dtype(array.dtype)
+    # JAX's own type for it: to ask for float64 by name, where it is off, would warn.
+    of_jax = jax.dtypes.canonicalize_dtype(float if is_integer else array.dtype)
+    dtype = of_jax if is_integer else working_dtype(of_jax)
     array = jnp.asarray(array.astype(dtype))
     if is_masked:
         array = jnp.where(np.ma.getmaskarray(values), jnp.nan, array)
