@@ -269,7 +269,8 @@ class ThinLens(eqx.Module):
         **Returns:** the lens: `focal_pixels` is `focal_length / sensor_width * width`, and
         `aperture` is `focal_length / f_number`.
 
-        **Raises:** `ValueError` for a number that is not positive.
+        **Raises:** `ValueError` for a number that is not positive, or a focus distance within
+        the focal length, as millimetres beside metres give it.
 
         **Gradient:** exact.
 
@@ -291,8 +292,13 @@ class ThinLens(eqx.Module):
                 ("sensor_width", sensor_width),
             )
         )
+        name = "from_sensor(focus_distance)"
+        distance = parameter(name, focus_distance)
+        # Blender's own numbers, 50 mm and 2.6 m, would be a lens 17.9 m wide at f/2.8.
+        expected = "beyond `focal_length`, both in one unit (focus_distance - focal_length > 0)"
+        check(name, distance - focal_length, _positive, expected)
         width = whole_number("from_sensor(width)", width)
-        return cls(focal_length / f_number, focus_distance, focal_length / sensor_width * width)
+        return cls(focal_length / f_number, distance, focal_length / sensor_width * width)
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
         """The lens' factor of the defocus, never negative, and the depth's, with the sign."""

@@ -398,6 +398,11 @@ def sensor(**changes):
         (lambda: physical(f_number=0), r"`from_physical\(f_number=...\)` must be positive"),
         (lambda: sensor(f_number=-1), r"`from_sensor\(f_number\)` must be positive, got -1"),
         (lambda: sensor(width=-2), r"`from_sensor\(width\)` must be a positive integer"),
+        # Blender's distance is in metres, its other lengths are in millimetres.
+        (
+            lambda: sensor(focus_distance=2.6),
+            r"`from_sensor\(focus_distance\)` must be beyond `focal_length`, both in one unit",
+        ),
     ],
 )
 def test_errors(call, message):

@@ -111,12 +111,12 @@ def nerf(transform_matrix: Any, focal: Any, center: Any, size: tuple[int, int]) 
         )
     if angle is None:
         fl_x = _positive("from_nerf(fl_x=...)", lengths[0])
-        fl_y = fl_x if lengths[1] is None else _positive("from_nerf(fl_y=...)", lengths[1])
     else:
         name = "from_nerf(camera_angle_x=...)"
         angle = parameter(name, angle)
         check(name, angle, lambda v: (v > 0) & (v < np.pi), "in (0, pi) radians")
-        fl_x = fl_y = width / (2 * jnp.tan(angle / 2))
+        fl_x = width / (2 * jnp.tan(angle / 2))
+    fl_y = fl_x if lengths[1] is None else _positive("from_nerf(fl_y=...)", lengths[1])
     middle = (
         parameter(f"from_nerf({name}=...)", side / 2 if value is None else value)
         for name, side, value in zip(("cx", "cy"), (width, height), center, strict=True)

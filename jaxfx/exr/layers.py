@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxfx._arrays import ArrayLike
+from jaxfx._checks import as_numpy
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.exr import _seal
@@ -59,7 +60,7 @@ def _planes(channels: Mapping[str, Any]) -> dict[str, np.ndarray]:
         name = f"write(channels[{key!r}])"
         if not isinstance(key, str) or "\0" in key or len(key.encode()) > 253:
             raise ValueError(f"`{name}` must be named by at most 253 bytes, none of them 0.")
-        array = np.asarray(value)
+        array = as_numpy(name, value)
         letters = _letters(key, array.shape) if array.ndim in (2, 3) and array.size else ""
         if not letters:
             expected = (

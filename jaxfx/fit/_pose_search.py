@@ -35,6 +35,9 @@ _DEVIATION_OF_MEDIAN = 1.4826
 # and in units of radiance; of relative depth, a ratio. Without them an exact reprojection would
 # be divided by 0.
 _LEAST_COLOR, _LEAST_RADIANCE, _LEAST_DEPTH = 1e-3, 1e-9, 1e-4
+# What is `_SKY` times as far as the nearest `_NEAR` of the pixels, ratios, has no share in the
+# unit of translations: renderers write 1e10 or more for a sky, which does not move.
+_SKY, _NEAR = 1e3, 0.05
 
 
 def search(
@@ -45,7 +48,9 @@ def search(
     Returns the residual of the last search and where that ended, with the losses of all.
     """
     is_known = jnp.isfinite(views.depth) & (views.depth > 0)
-    median_depth = jnp.nanmedian(jnp.where(is_known, views.depth, jnp.nan)).astype(float)
+    known = jnp.where(is_known, views.depth, jnp.nan)
+    is_near = known <= _SKY * jnp.nanquantile(known, _NEAR)
+    median_depth = jnp.nanmedian(jnp.where(is_near, known, jnp.nan)).astype(float)
     unit = jnp.concatenate([jnp.full(3, median_depth), jnp.ones(3, float)])
 
     def model(views: Views, sigma: float, twist: Array, stride: int = 1) -> Residual:

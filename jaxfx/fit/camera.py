@@ -56,7 +56,7 @@ class CameraFit(eqx.Module):
     - `share`: the share of the reference's pixels, a ratio, that were compared in the end.
     - `explained`: the share of the reference's contrast there, a ratio, that is explained: 1
       leaves no difference, 0 is no better than an even image.
-    - `reach`: the median depth, in scene units.
+    - `reach`: the median depth, in scene units, without a sky a thousand times as far.
     - `result`: optimistix' verdict on the last search, one of its `RESULTS`.
     """
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfx._arrays import ArrayLike
+from jaxfx._checks import as_numpy
 from jaxfx._extras import needs
 from jaxfx._files import StrPath, check_suffix, write_whole
 from jaxfx.io.srgb import linear_from_srgb, log_profile, recolor, srgb_from_linear
@@ -51,7 +52,7 @@ def write_png(path: StrPath, image: Float[ArrayLike, "height width channel"]) ->
         from PIL import Image
 
     check_suffix("write_png(path)", path, ".png")
-    array = np.asarray(image)
+    array = as_numpy("write_png(image)", image)
     if array.ndim != 3 or not array.size or array.shape[2] > 4 or array.dtype.kind != "f":
         raise ValueError(
             "`write_png(image)` must hold floats of shape (height, width, 1 to 4), "

@@ -156,6 +156,10 @@ def test_nerf():
     moved = PinholeCamera.from_nerf(pose, fl_x=60, fl_y=61, cx=30.0, cy=20.5, **size)
     x, y = 30 + 60 * local[:, 0] / -local[:, 2], 20.5 - 61 * local[:, 1] / -local[:, 2]
     assert_sees(moved, np.stack([x, y], axis=1), -local[:, 2], world)
+    # Pixels that are not square, beside an angle.
+    tall = PinholeCamera.from_nerf(pose, camera_angle_x=angle, fl_y=61, **size)
+    y = HEIGHT / 2 - 61 * local[:, 1] / -local[:, 2]
+    assert_sees(tall, np.stack([pixels[:, 0], y], axis=1), -local[:, 2], world)
 
 
 def frustum(left, right, bottom, top, near, far):

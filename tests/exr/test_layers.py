@@ -170,6 +170,8 @@ IMAGE = np.zeros((3, 2, 3), np.float32)
             r"`write\(channels\['x'\]\)` must hold real .*complex128",
         ),
         ({"x": IMAGE.astype(str)}, r"must hold real numbers"),
+        ({"depth": np.ma.masked_equal(IMAGE[:, :, 0], 0)}, r"\['depth'\]\)` .* got a masked"),
+        ({"x": None}, r"\['x'\]\)` must be an array, got None"),
         ({"a\0b": IMAGE}, "must be named by"),
         ({"a" * 254: IMAGE}, "must be named by at most 253 bytes"),
     ],

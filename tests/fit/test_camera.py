@@ -96,6 +96,32 @@ def test_one_hole_in_the_depth_does_not_count(hole, dtype):
 
 
 @pytest.mark.full
+def test_a_sky_over_most_of_the_image_is_one_at_infinity():
+    """The number that a renderer writes for it decides neither the pose nor its error."""
+    y, x = np.mgrid[:32, :32] / 32
+    image = np.stack([np.sin(9 * x + 3 * y), np.cos(7 * y), np.sin(5 * x * y)], -1) / 2 + 0.5
+    image[22:] = 0.5  # Without a texture the near part leaves the position unsure.
+    noise = np.random.default_rng(0).normal(0, 0.01, image.shape)
+    pictures = [(image + noise).astype(np.float32), image.astype(np.float32)]
+    eye = PinholeCamera.from_fov(0.9, height=32, width=32)
+    start = moved(eye, (0, 1, 0), 0.0, (0.3, 0, 0))
+
+    def fitted(sky):
+        depth = np.full((32, 32), 2, np.float32)
+        depth[:22] = sky
+        return fit.camera(*pictures, depth, eye, start, throw=False, progress=False)
+
+    expected = fitted(np.inf)
+    for sky in (1e10, 3e38):
+        found = fitted(sky)
+        assert float(found.reach) == 2 and found.success == expected.success
+        np.testing.assert_allclose(found.wander, expected.wander, rtol=0.01)
+        np.testing.assert_allclose(
+            found.camera.world_from_camera, expected.camera.world_from_camera, atol=1e-3
+        )
+
+
+@pytest.mark.full
 def test_a_pose_is_recovered_from_a_depth_with_holes():
     """As a depth camera leaves them: blobs, and a strip beside each step."""
     reference, image, depth, source, true = pictures()

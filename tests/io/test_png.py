@@ -180,6 +180,8 @@ def test_errors_of_shape(tmp_path, shape):
 def test_errors_of_type_and_folder(tmp_path):
     with pytest.raises(ValueError, match=r"`write_png\(image\)` must hold floats .* got uint8"):
         inspect.unwrap(io.write_png)(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"`write_png\(image\)` must .* got a masked array"):
+        inspect.unwrap(io.write_png)(tmp_path / "a.png", np.ma.zeros((4, 5, 3)))
     with pytest.raises(FileNotFoundError, match=r"cannot write `a.png` here"):
         io.write_png(tmp_path / "no" / "a.png", np.zeros((4, 5, 3)))
 
