@@ -1,4 +1,4 @@
-"""A candidate for many lights: each light only in the tiles to which it brings enough."""
+"""A cheaper way to render many lights: each light only in tiles where it adds enough light."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -15,17 +15,17 @@ from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of
 from jaxfx.relight.shading import reflected, to_surface
 
 
-# A light that is needed in a larger part of the image, a ratio, is computed everywhere: a pixel
-# of a block takes about three times as long as one of the whole image.
+# A share of the tiles. A light that is needed in more of them than this is computed in all
+# pixels: a pixel in a block takes about three times as long as one of the whole image.
 _EVERYWHERE = 1 / 3
 
 
 class Tiled(eqx.Module):
     """Some lights everywhere, others in some tiles, the rest nowhere.
 
-    - `everywhere`, `shadowed`: static; the lights of all pixels, and those whose shadows are
-      read.
-    - `parts`: the pixels of the others.
+    - `everywhere`: static; indices of the lights that are computed in all pixels.
+    - `shadowed`: static; indices of the lights, of either kind, whose shadows are read.
+    - `parts`: the lights that are computed in some tiles, with the pixels of these tiles.
     """
 
     everywhere: tuple[int, ...] = eqx.field(static=True)
@@ -36,7 +36,7 @@ class Tiled(eqx.Module):
     def __call__(self, gbuffer: Any, camera: Any, lights: Any, visibilities: Any = None) -> Any:
         """The image, called like `relight.render`."""
 
-        # Outside of the program, which so does not depend on which lights these are.
+        # Picked outside of the compiled program, which then serves any choice of lights.
         name = "relight(visibilities)"
         read = {n: as_array(name, visibilities[n]) for n in self.shadowed}
         chosen = lambda members: [(lights[n], read.get(n)) for n in members]
@@ -51,7 +51,8 @@ def try_tiles(search: Search, brought: Energy) -> None:
     is_free = np.isin(np.arange(brought.energy.shape[1]), free)
     energy = np.where(is_free[None], brought.unshadowed, brought.energy)
     order = np.argsort(energy, axis=1)
-    # Lights that bring amounts a, b, ... bring no more than a + b + ... together.
+    # An energy is the square of a norm, and the norm of a sum is at most the sum of the norms.
+    # So this bounds the energy that a tile lacks without its 1, 2, ... weakest lights.
     missing = np.cumsum(np.sqrt(np.take_along_axis(energy, order, axis=1)), axis=1) ** 2
     squares = np.pad(missing, ((0, 0), (1, 0)))
     fewest = spend(squares, search.max_error - spent, brought.size)
@@ -113,6 +114,7 @@ def _tiled(gbuffer, camera, everywhere, parts):
 
         @jax.checkpoint
         def block(pixels, each, lights=lights, shadows=shadows):
+            # Indices beyond the image fill up a block: they read anything and write nothing.
             item, where = each
             here = jax.tree.map(lambda x: x.at[where].get(mode="clip")[None], flat)
             shown = reflected(here, jax.tree.map(lambda x: x[item], lights))[0]

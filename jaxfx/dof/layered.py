@@ -1,4 +1,4 @@
-"""Depth of field by scatter that knows what hides what, from one layer of depth or two."""
+"""Depth of field by scattered sprites, with occlusion, from one or two layers of depth."""
 
 import functools as ft
 import math
@@ -19,14 +19,15 @@ from jaxfx.dof.sprites import POINT_RADIUS
 from jaxfx.lens import Lens
 
 
-# Least difference in defocus between an occluder and a hidden point, in pixels: their quotient
-# with the distance stays finite.
+# Pixels. The least difference in defocus between an occluder and a hidden point: lengths are
+# divided by it.
 _SMALLEST_GAP = 1e-3
 # Square of a slope, in pixels of defocus per pixel, below which both neighbours count alike.
 # With 0 the weights of two equal slopes are 0 / 0; larger, and edges blur the slope.
 _LEVEL = 1e-2
-# Share of the lens, 0 to 1, from which on a hidden point that it sees counts in full. With 1,
-# points that part of the lens sees would count too little and the fallback colour too much.
+# Share of the lens, 0 to 1. A point of the second layer counts in full if at least this share
+# sees it. With 1, points that part of the lens sees would count too little, and the fallback
+# colour too much.
 _SEEN = 0.25
 
 
@@ -57,7 +58,7 @@ def layered(
       shaped as `image` and `depth`; its depth is inf where there is none, or as in `depth`
       where it is missing.
     - `threshold`: pixels; how much the defocus changes from slice to slice. One default
-      serves all scenes that were tried. Below a 128th of `max_coc` it is that.
+      serves all scenes that were tried. Values below `max_coc / 128` are raised to that.
 
     **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
     number spoils what its sprite can reach. One whose depth is missing has no sprite: it shows
@@ -69,9 +70,9 @@ def layered(
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
     every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
     where a circle of confusion is below a pixel or above `max_coc`: a search cannot leave a
-    lens all of whose circles are. There is no kink where neighbours have one depth or a surface
-    is in focus. At the others, the ends of a clamp and a lens that is just filled, each sprite
-    and pixel has the value of one side.
+    lens all of whose circles are so. There is no kink where neighbours have the same depth or a
+    surface is in focus. Kinks remain where a radius is clamped and where a lens is just filled:
+    the gradient there is that of one side.
 
     **Example:**
 
@@ -82,31 +83,32 @@ def layered(
     >>> dof.layered(image, depth, lens).shape
     (8, 8, 3)
 
-    A sprite that arrives at a pixel stands for a share of the pixel's lens: its coverage over
-    its area, times `1 - (p - q) . grad log(defocus)`, for a surface whose defocus changes turns
-    towards one side of the lens. The shares of the surfaces that a lens sees add up to one. So
-    sprites fill it from the front: sorted into slices of defocus, `threshold` wide, each slice
-    takes what room is left, and what lies behind a full lens is hidden. Where the lens is not
-    filled, since the image does not hold what it sees there, the mean of what has arrived
-    stands for the rest, each contribution weighted by 0.1 plus the share that was filled when
-    it arrived: surfaces that are not seen rather lie behind.
+    A sprite at `p` that covers pixel `q` stands for a share of that pixel's lens: its coverage
+    over its area, times `1 + (q - p) . grad log(defocus)`, since a surface whose defocus
+    changes is turned towards one side of the lens. The shares of all surfaces that a lens sees
+    add up to one. So sprites fill it from the front: sorted into slices of defocus, `threshold`
+    wide, each slice takes what room is left, and what lies behind a full lens is hidden. Where
+    the image lacks what a lens sees, the lens is not filled. The rest of it gets a mean of what
+    has arrived, each contribution weighted by 0.1 plus the share that was filled when it
+    arrived: a surface that the image lacks is more likely to be one that lies behind.
 
     A slanted floor is thereby one surface, whatever slices it is cut into: their shares add up.
-    Slices are painted by spans, at a cost that grows with the radius, and its gradient's with
-    it.
+    Slices are painted row by row of each disc. The time, also that of the gradient, grows with
+    the radius.
 
     With a second layer its sprites fill what the first leaves. A point of it counts where the
     lens sees past the first layer: in 8 directions the first layer is followed from the pixel
     as long as it lies in front of the point, which gives the part of the lens that it covers.
-    A point less than one slice behind is of the surface that hides it, and two behind it is of
-    another in full.
+    A point less than one slice behind is taken to be of the surface that hides it, and one of
+    two slices or more behind to be of another surface. In between the share rises linearly.
 
-    What it does badly: what no layer shows is guessed from its surroundings, as is what lies
-    beyond the frame, where the last pixels are repeated. Within a slice nothing hides anything.
-    Two edges one before the other are taken to hide different parts of the lens.
+    Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
+    the frame, where the last pixels are repeated. Within a slice nothing hides anything. The
+    parts of the lens that two edges hide are added up, even where they overlap.
 
-    Source: our own. Kin: Lee, Kim & Choi 2008 and Franke et al. 2018 composite layers per
-    pixel or per tile; the over of premultiplied colours is that of Porter & Duff 1984.
+    Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
+    composite layers per pixel or per tile; compositing of premultiplied colours ("over") is
+    from Porter & Duff 1984.
     """
     own = lens
     image, depth, lens, max_coc = check_arguments("layered", image, depth, own, max_coc)
@@ -229,10 +231,10 @@ def _seen(
     """The share of the lens, per pixel, that sees a point of the second layer.
 
     `farther` is the point's defocus, `defocus` that of the first layer. In 8 directions the
-    first layer is followed from the point's own pixel while it lies in front of the point. A
-    pixel of it at some distance, and with some difference in defocus, hides the point from the
-    place on the lens that is the quotient of the two, in radii of the lens. The first layer
-    ends where its defocus comes much nearer to the point's than it was at the start.
+    first layer is followed from the point's own pixel while it lies in front of the point. Each
+    of its pixels hides a piece of the lens's radius in that direction: the length of the step
+    over half the difference in defocus, in radii of the lens. The first layer is taken to end,
+    gradually, where that difference falls below half of what it was at the start.
     """
     height, width = defocus.shape
     steps = int(max_coc) + 1

@@ -1,8 +1,9 @@
-"""The noise that `fit.dof` estimates for each pixel, and which pixels share one.
+"""The noise that `fit.dof` estimates for each pixel, and groups of pixels that err alike.
 
-Photographs show surfaces that the one image hides. What an effect draws beside an edge in depth
-is therefore wrong by more than noise. Pixels near edges get a standard deviation of their own;
-pixels that differ by many standard deviations (a lamp) are left out.
+A photograph with a wide aperture shows surfaces that are hidden in the image from which the
+effect is drawn. Near an edge in depth, the drawn image is therefore wrong by more than noise.
+So pixels near edges get a standard deviation of their own, larger than that of the others.
+Pixels that differ by many standard deviations (a lamp) are left out.
 """
 
 import dataclasses
@@ -31,25 +32,26 @@ _WITHIN = 0.68
 _LEAST_NOISE = 1e-3
 
 # A pixel that differs by more standard deviations than this is left out until the noise is
-# estimated again: the loss of a lamp would hide what a step gains. Below some 5, pixels are
-# lost that the lens shows in.
+# estimated again: the loss of a lamp would be so large that improvements elsewhere vanish in
+# it. Below about 5, pixels are left out that show the effect of the lens.
 _OUTLIER = 20.0
 
 # By how much an unknown (a logarithm) is moved to see which pixels depend on it. A smaller one
 # measures rounding in float32, a larger one is no longer linear.
 _NUDGE = 0.03
 
-# Strata of each of the two noises, by circle of confusion. Each stratum is one block of the
-# jackknife: of fewer, the variance is estimated poorly; in more, pixels of one error are taken
-# for independent.
+# Number of groups ("strata") by circle of confusion into which the pixels near edges are
+# divided, and as many for those far from edges. Each is one block of the jackknife. With fewer,
+# its variance is estimated poorly; with more, pixels with a common error count as independent.
 STRATA = 6
 
 
 def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
     """The residual with the noise that its pixels have at these unknowns, and Huber's loss.
 
-    The noise is taken from the differences of pixels by how much each depends on the parameters
-    that are sought: the median of all would be that of even surfaces, which show no lens.
+    The noise is a quantile of the differences of pixels, each weighted by how much the pixel
+    depends on the parameters that are fitted. Unweighted, it would be that of even surfaces, in
+    which the lens does not show.
     `has_edges`: whether pixels that the sprite of an edge in depth reaches have a noise of
     their own.
     """
@@ -66,7 +68,10 @@ def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
 
 @eqx.filter_jit
 def _noise(model, values, difference, sensitivity, has_edges):
-    """Standard deviations in units of radiance: per pixel, and of pixels far from edges."""
+    """Standard deviations in units of radiance: per pixel, and of pixels far from edges.
+
+    The first is inf for pixels that are left out.
+    """
     sensitivity = sensitivity * model.images.weights[None, ..., None]
     tiny = jnp.finfo(sensitivity.dtype).tiny
     least = _LEAST_NOISE * jnp.std(model.images.references) + tiny
@@ -96,9 +101,10 @@ def _defocus(model: Model, values: Values) -> Float[Array, "photograph height wi
 
 
 def _near_edges(defocus: Array, circles: Array, max_coc: int | float) -> Array:
-    """The pixels that sprites beside an edge in depth reach, or that come from the frame.
+    """The pixels that the sprites of an edge in depth reach, or those of the frame's border.
 
-    What lies beyond the frame is in no image. A hole is no edge: its neighbours differ by NaN.
+    The border counts as an edge, because no image holds what lies beyond it. A missing depth is
+    no edge: its difference to its neighbours is NaN.
     """
     edge = jnp.ones(defocus.shape, bool).at[1:-1, 1:-1].set(False)
     # The defocus of a plane is linear in the pixel's place, so that a slope is no edge.
@@ -123,10 +129,12 @@ def strata(
     channels: int,
     bins: int = STRATA,
 ) -> Int[Array, " residual"]:
-    """The stratum of each residual, out of `2 * bins`: like noise, like circle of confusion.
+    """The stratum of each residual, 0 to `2 * bins - 1`.
 
-    What an effect draws wrong depends on the circle of confusion and on edges, not on the
-    pixel: all pixels of a stratum may err together. Strata of one noise have one size.
+    The first `bins` are for pixels of the least noise, the others for all other pixels, those
+    left out included. Either half is sorted by circle of confusion and divided equally. The
+    error of a drawn image depends on the circle of confusion and on edges, so that all pixels
+    of a stratum may have the same error.
     """
     is_noisy = (scale > jnp.min(scale)).reshape(-1)
     circles = circles.reshape(-1)

@@ -1,8 +1,8 @@
 """What `synthesize` and `choose` share: their arguments, and how a cache is looked up.
 
-Every pixel of the new view whose depth is known is a point in world space. `look_up` projects
-the points into a cache, reads the nearest pixel there, and tests whether that pixel shows the
-same surface.
+A cache is a G-buffer of an earlier view, with its camera. Every pixel of the new view whose
+depth is known is a point in world space. `look_up` projects the points into a cache, reads the
+nearest pixel there, and tests whether that pixel shows the same surface.
 """
 
 from typing import Any, NamedTuple
@@ -21,15 +21,17 @@ from jaxfx.gbuffer import GBuffer
 
 Vectors = Float[Array, "height width 3"]
 Scalars = Float[Array, "height width"]
-# In tolerances: how far the cached surface may lie from the point along the cache's ray. Across
-# the surface it is one tolerance; this bound matters only where the cache sees the surface at
-# less than about 7 degrees, where nearly any depth passes the other. Smaller values reject
-# surfaces at grazing angles, larger ones accept what lies behind a silhouette.
+# A multiple of the tolerance: how much the cached depth may differ from the point's depth in
+# the cache. The distance perpendicular to the surface may be one tolerance, so that this bound
+# matters only where the cache sees the surface at less than about 7 degrees; there nearly any
+# depth satisfies the other bound. Smaller values reject surfaces at grazing angles, larger ones
+# accept what lies behind a silhouette.
 _LONGEST_ALONG_RAY = 8
 # Cosine. A surface whose normal makes less than this with the ray to the new camera faces away.
 # Below 0, because interpolated normals face away a little at silhouettes; 0 opens holes there.
 _LEAST_COSINE = -0.1
-# Cosine. Frontality counts for no less in `detail`, so that every cache's weight is positive.
+# Cosine. The least value in `detail` of a surface's frontality (the cosine between its normal
+# and the direction to the cache's camera), so that every cache's weight is positive.
 _LEAST_FRONTALITY = 0.01
 
 
@@ -52,8 +54,10 @@ class CacheSamples(NamedTuple):
     - `is_visible`: whether the cache sees the point.
     - `pixel`: flat index of the cache's pixel that was read.
     - `shader`, `normal`: of that pixel.
-    - `distance`: from the point to that pixel's surface, across it, as a ratio of the depth.
-    - `detail`: cache pixels on a square of the surface whose side is the point's depth.
+    - `distance`: from the point to the plane through that pixel's surface, as a ratio of the
+      point's depth in the cache.
+    - `detail`: how finely the cache shows the surface: the number of its pixels on a square of
+      the surface whose side is as long as the point's depth in the new view.
     """
 
     is_visible: Bool[Array, "height width"]
@@ -114,7 +118,8 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     """The cache's nearest pixel to each point, and whether that shows the point's surface.
 
     It does if the point lies within `tolerance` (a ratio of the depth) of the pixel's surface,
-    and if that surface faces the new camera.
+    if the depths differ by at most `_LONGEST_ALONG_RAY` times that, and if the surface faces
+    the new camera.
     """
     height, width = gbuffer.depth.shape
     dtype = points.depth.dtype
@@ -132,12 +137,14 @@ def look_up(gbuffer: GBuffer, camera: Camera, points: Points, tolerance: float) 
     center = jnp.stack([index % width, index // width], axis=-1).astype(dtype) + 0.5
     offset = points.position - camera.unproject(center, cached_depth)
     across, along = jnp.abs(_dot(normal, offset)), jnp.abs(depth - cached_depth)
+    # Where the cache has no normal, the difference in depth stands for the distance.
     across = jnp.where(_dot(normal, normal) > 0, across, along)
     distance = jax.lax.stop_gradient(across / jnp.where(is_filled, depth, 1))
     is_visible = is_filled & (distance <= tolerance)
     is_visible &= along <= _LONGEST_ALONG_RAY * tolerance * depth
     is_visible &= _dot(normal, points.to_camera) > _LEAST_COSINE
 
+    # The unit of length for `detail`: the point's depth in the new view.
     unit = jax.lax.stop_gradient(points.depth)
     to_camera = camera.unproject(center, jnp.zeros_like(cached_depth)) - points.position
     to_camera = normalize(to_camera / unit[..., None])

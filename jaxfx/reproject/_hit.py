@@ -6,8 +6,8 @@ implicit function theorem gives dt = -d(miss) / (d miss / dt): the time is const
 and its tangent comes from `miss`, computed from differentiable arguments at that time. No loop
 is differentiated.
 
-`height_field` is the inverse depth -1/z for `warp`, the depth for `intersect`: what is written
-here holds in both. Only `is_depth_step`, and with it a `threshold`, is for inverse depth alone.
+`height_field` is -1/z (called inverse depth here) for `warp`, and the depth for `intersect`.
+All functions work for both, but `is_depth_step`, and thus a `threshold`, needs inverse depth.
 """
 
 from typing import Any, NamedTuple
@@ -20,10 +20,11 @@ from jaxfx._numerics import safe_divide
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, not_before_start
 
 
-# Newton steps on a patch. With fewer, more hits stay on their texel; more cost time.
+# Newton steps on a patch. With fewer, more rays do not converge, and so keep the point of the
+# texel; more cost time.
 _NEWTON_STEPS = 4
 # Texels. How far from the texel's hit the patch may be met. A patch lies within a texel of its
-# centre; larger values accept a hit on another sheet of the patch.
+# centre; larger values accept a hit on another part of the surface.
 _REACH_TEXELS = 1.5
 # Texels. The length of the last Newton step below which the iteration has converged. Larger
 # values accept points off the patch; below the rounding error no ray converges.
@@ -55,7 +56,7 @@ class Patch(NamedTuple):
     def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
         """The weighted mean of each channel: ray channel.
 
-        The loop keeps the stencil in memory. Fused, each channel would repeat the search.
+        `scan` stores the stencil. Without it, XLA would fuse the search into each channel.
         """
 
         def add(sums: tuple[Array, Array], texel: tuple[Array, Array, Array]) -> Any:
@@ -111,9 +112,9 @@ def edge_aware_patch(
 
 
 def is_depth_step(a: Array, b: Array, threshold: int | float) -> Array:
-    """Whether two inverse depths -1/z are of two surfaces: z differs by more than a ratio.
+    """Whether two inverse depths -1/z belong to different surfaces.
 
-    The ratio is to the nearer z: (z_far - z_near) / z_near > threshold.
+    They do if (z_far - z_near) / z_near > threshold.
     """
     nearer, farther = jnp.minimum(a, b), jnp.maximum(a, b)
     return farther - nearer > -threshold * farther
@@ -123,8 +124,9 @@ class SurfacePoint(NamedTuple):
     """Where each ray meets the surface, differentiable.
 
     - `position`: a point of the ray: x and y in texels, and the third coordinate.
-    - `grazing`: whether the ray meets the surface too obliquely for a derivative or a point of
-      its own. See `texel_point` and `patch_point`.
+    - `grazing`: from `texel_point`: whether a ray that hits runs along the top, and so has no
+      derivative. From `patch_point`: whether a ray that hits keeps the texel's point, because
+      it grazes the patch or Newton's method did not converge.
     """
 
     position: Float[Array, "ray 3"]
@@ -150,8 +152,8 @@ def _texel_miss(
 ) -> tuple[Float[Array, " ray"], Float[Array, " ray"]]:
     """The function that is 0 at the hit of a top or side, and its derivative along the ray.
 
-    For a side it lacks the constant border: only its tangent is used. For a ray that starts
-    inside the column it is 0: the time does not depend on anything.
+    Only its tangent is used. So for a side the constant position of the border is left out. For
+    a ray that starts inside the column it is 0: the time does not depend on anything.
     """
     x, y, z = jnp.moveaxis(origin + hit.time[:, None] * direction, -1, 0)
     dx, dy, dz = jnp.moveaxis(jax.lax.stop_gradient(direction), -1, 0)
@@ -206,8 +208,8 @@ def patch_point(
         last_move = jnp.where(moves, jnp.abs(move), otherwise)
         return jnp.where(moves, jnp.clip(time + move, low, high), time), last_move, slope
 
-    # One iteration more, for the slope at the end: a loop's result is in memory, so that XLA
-    # does not compute it again in each consumer.
+    # One more iteration only computes the slope at the end. A loop's result is stored; outside
+    # of the loop, XLA would compute the slope again wherever it is used.
     start = hit.time, jnp.full_like(hit.time, jnp.inf), jnp.ones_like(hit.time)
     time, last_move, slope = jax.lax.fori_loop(0, _NEWTON_STEPS + 1, newton, start)
     terms = jnp.abs(d[:, 2]) + jnp.abs(slope - d[:, 2])
@@ -225,7 +227,10 @@ def patch_point(
 def _implicit_point(
     origin, direction, time, miss, slope, is_differentiable, grazing
 ) -> SurfacePoint:
-    """The position at a time that follows the root of `miss` where `is_differentiable`."""
+    """The position at `time`; its derivative is that of the root of `miss`.
+
+    Where not `is_differentiable`, the time is constant.
+    """
     miss = jnp.where(is_differentiable, miss, 0)
     time = _implicit_root(time, miss, jnp.where(is_differentiable, slope, 1))
     return SurfacePoint(origin + time[:, None] * direction, grazing)

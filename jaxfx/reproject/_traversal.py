@@ -1,8 +1,11 @@
 """The exact search: a traversal of a minimum pyramid, many rays at a time.
 
+Rays run over the grid of a height field. Each texel is a solid column that begins at the
+texel's value in z and extends to infinity. The search finds the first column that a ray meets.
+
 The state of a ray is one integer: the texel in which it is, and the level of the pyramid that
-it reads next. So one step of all rays is one fused loop with one result; the time of a ray
-follows from its texel.
+it reads next. So one step of all rays is one fused loop with one result. The time (the ray's
+parameter) is not stored: it follows from the texel.
 
 A step reads the cell of that level that holds the texel. If the ray reaches the cell's nearest
 value before it leaves the cell, the ray moves there and goes down in levels; at level 0 that
@@ -43,13 +46,14 @@ from jaxfx.reproject._crossings import (
 )
 
 
-# Bits of a state for a column, and for a row. With 2 signs and 4 bits of level they fill 32.
+# Bits of a state for the texel's x, and for its y. With 2 signs and 4 bits of level: 32 bits.
 _TEXEL_BITS = 13
 # The largest height and width in texels: what 13 bits count. Checked for every argument.
 LARGEST_SIDE = 2**_TEXEL_BITS
 _TEXEL_MASK = LARGEST_SIDE - 1
 _LEVEL_SHIFT = 2 * _TEXEL_BITS + 2
-# Levels that mean that a ray is done. A pyramid has levels 0 to 13, of 4 bits.
+# Values in place of a level that mean that a ray is done. Real levels are 0 to 13; the field
+# has 4 bits.
 HIT, MISS = 15, 14
 # Rays. Up to this number rays are not packed: that would cost more than the steps saved.
 # Measured; a wrong value costs time only.
@@ -63,11 +67,12 @@ _LANES = 64
 # A ratio. Unfinished rays are packed once they are at most 1 in 3: the steps computed are then
 # at most three times those needed. A wrong value costs time only.
 _PACKING_RATIO = 3
-# Steps between two checks of an accelerator's host whether any ray is unfinished. Each check
-# waits for the device; up to 5 steps are wasted at the end. A wrong value costs time only.
+# Steps after which an accelerator's host checks whether any ray is unfinished. Each check waits
+# for the device; up to 5 steps are wasted at the end. A wrong value costs time only.
 _STEPS_PER_CHECK = 6
-# Levels. A ray goes down by two where it reaches a value, up by one where it leaves the cell
-# two levels above. Measured: a seventh fewer steps than with one. Any value gives the same hit.
+# Levels. A ray goes down by this many where it reaches a value. It goes up by one where it also
+# leaves the cell that lies this many levels above. Measured: a seventh fewer steps than with 1.
+# Any value gives the same hit.
 _LEVEL_STRIDE = 2
 # Cells. The first level is such that a ray crosses at most 4 of its cells between the nearest
 # and the farthest value. Measured. Any value gives the same hit.
@@ -75,7 +80,10 @@ _START_CELLS = 4
 
 
 def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> UInt32[Array, "..."]:
-    """The state: column, row, level; 1 or 0 for a ray that runs to the left, and upwards."""
+    """The state of rays in texel (x, y). From the lowest bit: x, y, up, left, level.
+
+    `left` and `up` are 1 for a ray that runs towards smaller x and towards smaller y, else 0.
+    """
     bits = level.astype(jnp.uint32)
     for size, value in ((1, left), (1, up), (_TEXEL_BITS, y), (_TEXEL_BITS, x)):
         bits = (bits << size) | value.astype(jnp.uint32)
@@ -148,7 +156,7 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
 def _clip_to_cell(
     texel: Array, current: Array, cell: Array, level: Array, backward: Array
 ) -> Array:
-    """A row or column, clipped to those of a cell that the ray has not yet passed."""
+    """The x or y of a texel, clipped to the part of a cell that the ray has not yet passed."""
     first, last = cell << level, ((cell + 1) << level) - 1
     low = jnp.where(backward == 1, first, current)
     high = jnp.where(backward == 1, current, last)
@@ -193,9 +201,9 @@ def traverse(
 def _first_states(pyramid: Pyramid, thickness: Array, r: GridRays):
     """States and step counts after the first step, which moves to the nearest value of all.
 
-    The level is then that whose cells fit the rest of the ray's length. Any level gives the
-    same hit; from the root it would take many more steps. `thickness` is the difference
-    between the farthest and the nearest value.
+    The level is then set by the number of texels that the ray crosses between the nearest and
+    the farthest value (their difference is `thickness`): at most `_START_CELLS` cells. Any
+    level gives the same hit; from the root it would take many more steps.
     """
     left, up = backward_axes(r)
     x, y, inside = entry_texel(r, *pyramid.shapes[0])

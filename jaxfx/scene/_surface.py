@@ -20,9 +20,9 @@ from jaxfx.scene._view import View
 
 # Reflectance at normal incidence of a dielectric of refractive index 1.5, as glTF 2.0 has it.
 _DIELECTRIC = 0.04
-# How far outside its face a hit may lie, in barycentric weight. Less clips the depth of pixels
-# that a rasteriser gave to a face which their centre just misses; more lets the depth of a face
-# seen edge-on run away.
+# How far outside its face a hit may lie, in barycentric weight. A smaller value clips the depth
+# of pixels that a rasteriser gave to a face which their centre just misses; a larger one allows
+# very wrong depths for a face seen edge-on.
 _SLACK = 0.05
 # In float32, so that signs do not turn normals to float64.
 _ONE = np.float32(1)
@@ -35,8 +35,9 @@ class Hits(NamedTuple):
     - `face`: index of the face.
     - `depth`: along the optical axis, in scene units.
     - `weights`: barycentric, in [0, 1].
-    - `normal`: the face's unit normal, on its front side, in camera space.
-    - `toward`: the ray's direction, of depth 1, in camera space.
+    - `normal`: the face's unit normal, on its front side, in camera space (but in world space
+      for `at_hits`).
+    - `toward`: the direction of the ray from the camera, scaled to depth 1, in camera space.
     """
 
     pixel: Int[np.ndarray, " hit"]
@@ -68,6 +69,7 @@ def intersect(scene: Scene, view: View, faces: Int[np.ndarray, "height width"]) 
     a, b, c = (corners.take(scene.faces[:, i].take(face), axis=1) for i in range(3))
     ab, ac, offset = b - a, c - a, origin - a
     normal = _cross(ab, ac)
+    # The determinant of the edges and the ray; 0 where the face is seen edge-on.
     volume = -_dot(normal, toward)
     volume = np.where(volume == 0, np.inf, volume)
     swept = _cross(offset, toward)
@@ -87,7 +89,7 @@ def _at_least(
 
 
 def to_gbuffer(scene: Scene, view: View, hits: Hits, height: int, width: int) -> GBuffer:
-    """The deep frame buffer of the hits; background in all other pixels."""
+    """The G-buffer of the hits; background in all other pixels."""
     color, metallic, roughness = _materials(scene, hits)
     dielectric = (1 - metallic)[:, None]
     specular = _DIELECTRIC * dielectric + color * metallic[:, None]

@@ -35,7 +35,7 @@ _LEAST_WINDOW = 7
 
 
 class Places(NamedTuple):
-    """Receivers as places in the padded map; every field is of one shape, any.
+    """Receivers as places in the padded map. All fields have the same shape, whatever it is.
 
     - `row`, `column`: of the texel that holds the receiver.
     - `threshold`: scene units; a texel that is nearer to the light than this shadows.
@@ -61,7 +61,7 @@ def set_up(
     slope_bias: Float[Array, ""],
     size: int,
 ) -> tuple[Texels, Places]:
-    """The padded map, and the receivers' places in it, for filters of up to `size` texels."""
+    """The padded map and the receivers' places in it, for filters up to `size` texels wide."""
     dtype = filter_dtype(shadow_map.dtype, receivers)
     texels = pad_map(shadow_map, size, dtype)
     return texels, find_places(receivers, bias, slope_bias, shadow_map.shape, size, dtype)
@@ -70,7 +70,8 @@ def set_up(
 def pad_map(shadow_map: Float[Array, "rows columns"], size: int, dtype: Any) -> Texels:
     """The map with a border of `size` texels at inf; missing texels are inf as well.
 
-    `_LANES - 1` more on the right are there to be read with a window's last row, not compared.
+    `_LANES - 1` more on the right allow windows to be read in whole vectors near the right
+    border; they are not compared.
     """
     depth = jnp.where(shadow_map > 0, shadow_map, jnp.inf).astype(dtype)
     widths = ((size, size), (size, size + _LANES - 1))
@@ -111,12 +112,16 @@ def filtered(shadow_map, receivers, bias, slope_bias, softness, size, kernel):
     result = mean_comparison(texels, places, softness, size, kernel).astype(receivers.z.dtype)
     if _is_step(kernel, softness):
         return result
-    # In memory: otherwise every tap's derivative computes the cotangent of the result again.
+    # `apart` stores the cotangent of the result, which every tap's derivative would otherwise
+    # compute again.
     return apart(result, lambda: result)
 
 
 def without_gradient(kernel: Kernel, arguments: tuple[Any, ...]) -> Any:
-    """The five arguments, held constant where the filter's derivative is 0 everywhere."""
+    """The arguments, held constant if the filter's derivative is 0 everywhere.
+
+    They are the map, receivers, bias, slope bias and, last, the softness.
+    """
     return jax.lax.stop_gradient(arguments) if _is_step(kernel, arguments[-1]) else arguments
 
 
@@ -158,7 +163,7 @@ def mean_comparison(
 
     total, weights_down = sum_rows(weighted_row, size)
     mean = total / (weights_down * sum(weights_across))
-    return _one_where(mean > 1, mean)  # by rounding
+    return _one_where(mean > 1, mean)  # Rounding can make it exceed 1.
 
 
 def compare(
@@ -211,6 +216,7 @@ def tap_weight(
         return jnp.ones_like(offset)
     if kernel == "tent":
         return jnp.maximum(half - absolute(offset), 0)
+    # The Gaussian at half the filter's width, which is 3 standard deviations: exp(-3**2 / 2).
     edge = jnp.exp(jnp.asarray(-4.5, offset.dtype))
     return jnp.maximum(jnp.exp(-0.5 * (offset * (3 / half)) ** 2) - edge, 0)
 
@@ -252,7 +258,7 @@ def _lit_share(texels: Texels, places: Places, size: int) -> Float[Array, "*plac
 
 
 def _box_mean(total: Float[Array, "*place"], size: int) -> Float[Array, "*place"]:
-    """`total / size**2`; exactly 1 where all taps are lit, whatever XLA makes of a division."""
+    """`total / size**2`; exactly 1 where all taps are lit, however XLA rounds the division."""
     return _one_where(total == size**2, total / size**2)
 
 

@@ -1,13 +1,13 @@
-"""The lens of each pixel, filled by slices from the front; and the adjoint of that.
+"""Compositing the slices at each pixel from front to back, and the adjoint of that.
 
-A slice sums, at a pixel, to light and to the share of the lens that it covers. Each slice takes
-the room that is left; behind the slice that fills the lens none is. The part of a lens that
-stays free has the mean colour of what arrived (the fallback colour), in which a contribution
-counts for more the more was filled before it.
+At a pixel, a slice has some light and the share of the pixel's lens that it covers. Each slice
+takes as much of the lens as is left; what lies behind a full lens is hidden. The share that no
+slice takes gets the fallback colour: a mean of the slices, each weighted by how full the lens
+was when it was added.
 
-The adjoint keeps no slice. Per pixel it knows the slice that filled the lens, the part of that
-slice that found room, and its colour. Slices in front count in full and, by the room that they
-take, against that colour.
+The adjoint does not store the slices. Per pixel it knows the number of the slice that filled
+the lens, its colour, and the fraction of it that found room. A slice in front of that one is
+added in full, and the room that it takes is lost to the slice that fills the lens.
 """
 
 from typing import NamedTuple
@@ -19,14 +19,15 @@ from jaxfx._numerics import sum_planes
 from jaxfx.dof.kernels._slices import Extent, Sheets
 
 
-# Number of a slice behind all others: the lens is not filled yet.
+# Stands for the number of the slice that filled the lens where no slice has filled it. Larger
+# than any number of a slice.
 _NEVER = 2**30
-# Units of rounding (machine epsilons): an aperture covered to within this many counts as full.
+# Machine epsilons. A lens that is filled up to this many counts as full.
 # Without them a sum of shares that rounds to just below 1 would let a sliver through.
 _ROUNDING = 32
-# Weight of a contribution in the fallback colour where nothing has been accumulated; it rises
-# linearly by 1 to where the aperture is covered. With 0 a pixel that
-# only its first slice reaches has no fallback colour; larger, and the foreground bleeds.
+# Weight of a contribution to the fallback colour where the lens is still empty; it rises
+# linearly, to 1 more where the lens is full. With 0, what reaches a lens that is nearly empty
+# has a weight near 0; with more, the colour of the foreground bleeds into the background.
 _FIRST = 0.1
 
 Stack = Float[Array, "value height width"]
@@ -37,9 +38,10 @@ class Filling(NamedTuple):
     """Accumulator of front-to-back compositing, per pixel.
 
     - `light`: the channels and, last, the share of the lens that is filled.
-    - `late`: the same, each contribution weighted as it counts in the fallback colour.
-    - `last`: the number of the slice that filled the lens; `arrived`: what that one summed to;
-      `part`: the part of it that found room.
+    - `late`: the same, each contribution times its weight in the fallback colour.
+    - `last`: the number of the slice that filled the lens, or `_NEVER`.
+    - `arrived`: the light and share of that slice, before it is reduced to the room left.
+    - `part`: the fraction of that slice that found room.
     """
 
     light: Stack
@@ -61,7 +63,7 @@ def nothing_filled(extent: Extent, sheets: Sheets) -> Filling:
 def fill(index: Int[Array, ""], arriving: Stack, state: Filling) -> Filling:
     """The accumulator after one more slice."""
     allowed, weight, full = allowance(arriving, state.light)
-    fills = full & (state.last == _NEVER)  # once
+    fills = full & (state.last == _NEVER)  # Slices behind that one do not find room either.
     found = allowed[None] * arriving
     return Filling(
         state.light + found,
@@ -75,11 +77,14 @@ def fill(index: Int[Array, ""], arriving: Stack, state: Filling) -> Filling:
 def allowance(
     arriving: Float[Array, "value height width"], light: Float[Array, "value height width"]
 ) -> tuple[Float[Array, "height width"], Float[Array, "height width"], Bool[Array, "*size"]]:
-    """The part of a slice that finds room behind what filled the lens; its weight for what
-    stays free, by how much is filled at the mean; and where not all of it finds room.
+    """How much of a slice finds room in a lens that is filled by `light`.
+
+    Three planes: the fraction that finds room; the slice's weight in the fallback colour, which
+    is the share filled when half of it has been added, plus `_FIRST`; and whether some of it
+    finds no room.
     """
     filled, share = light[-1], arriving[-1]
-    # Not less than nothing by rounding.
+    # Rounding must not make the room negative.
     room = 1 - _ROUNDING * jnp.finfo(light.dtype).eps - filled
     room = jnp.where(room > 0, room, 0)
     full = share > room
@@ -90,9 +95,11 @@ def allowance(
 class Reading(NamedTuple):
     """Values per pixel that the adjoint reads at every slice.
 
-    `bar` and `late_bar` are the cotangents of light and of the weighted light; `worth` is what
-    the slice that filled the lens would give for a unit of it, and `weight` that slice's in the
-    fallback colour. `start` is the carry of `read_slice`.
+    - `bar`, `late_bar`: the cotangents of `light` and of `late`.
+    - `weight`: that of the slice that filled the lens, in the fallback colour.
+    - `worth`: the derivative of the loss with respect to the share of the lens that this slice
+      gets.
+    - `start`: the carry of `read_slice` for the first slice.
     """
 
     filling: Filling
@@ -104,16 +111,17 @@ class Reading(NamedTuple):
 
 
 def begin_reading(filling: Filling, bar: Float[Array, "twice_value height width"]) -> Reading:
-    """The pixels before the adjoint comes to the first slice."""
+    """What `read_slice` needs; `bar` is the cotangent of `light` and `late`, concatenated."""
     bar, late_bar = jnp.split(bar, 2)
-    # The slice that fills a lens gives it as much of its colour as there is room.
+    # The slice that fills a lens adds its mean colour times the room that was left.
     arrived, part = filling.arrived, filling.part
     color = arrived / jnp.where(part > 0, arrived[-1], 1)[None]
     room = part * arrived[-1]
     weight = filling.light[-1] - room / 2 + _FIRST
     late_worth = sum_planes(late_bar * color)
     worth = sum_planes(bar * color) + weight * late_worth
-    # What takes room takes it from that, and makes all that comes later count for more.
+    # A slice in front leaves less room to that one, and increases the weights in the fallback
+    # colour of all slices behind. `ahead` is the derivative of the loss through those weights.
     ahead = sum_planes(late_bar * filling.light) - room * late_worth / 2
     return Reading(filling, bar, late_bar, weight, worth, (jnp.zeros_like(part), ahead))
 

@@ -1,17 +1,20 @@
-"""A slice of sprites, painted by spans block by block, and the adjoint of that.
+"""Painting the disc-shaped sprites of one slice of defocus, and the adjoint of that.
+
+Each row of a disc is a span of pixels. Only its two ends are written; a running sum along the
+row then fills it. This is done block by block.
 
 A slice is the sprites of about one defocus, so that all of them have about one radius. Blocks
 that hold none are skipped; in the others the sprites of the slice are gathered first.
 
 Where the defocus changes along a surface, its points crowd together as seen from one side of
 the lens and thin out from the other: a sprite's weight at an offset is `1 + tilt . offset`.
-Across rows the factor is that; along a row the span is moved by `tilt * half_width**2 / 3`,
-which keeps its sum and gives it the same centre.
+Each row is weighted by the factor for its y. Along x a span has one weight; instead it is moved
+by `tilt_x * half_width**2 / 3`, which keeps its sum and gives it the right centre of mass.
 
-A running sum rounds what it carries: sprites that are large beside what a pixel sums to are
-painted tap by tap instead.
+A running sum keeps the rounding errors of the values that it has passed. Sprites that are much
+brighter than the sum in a pixel are therefore painted pixel by pixel ("tap by tap") instead.
 
-What it does not do well: XLA writes scattered values on one core.
+Known limit: XLA runs a scatter on one core.
 """
 
 import functools as ft
@@ -32,20 +35,21 @@ from jaxfx.dof.sprites import POINT_RADIUS, reach, segment_integral
 # Height and width of a block in pixels: with the margin that its sprites reach it takes half a
 # megabyte at a radius of 32, which fits a core's cache. Larger blocks do not.
 BLOCK = (64, 64)
-# Sprites painted per turn of a loop: by spans, and tap by tap. More waste work on empty places,
-# fewer cost turns.
+# Sprites painted per iteration of a loop: by spans, and tap by tap. Larger values waste work in
+# the last iteration, which is rarely full; smaller ones need more iterations.
 CHUNK, BRIGHT_CHUNK = 1024, 16
 # The most slices to either side of the focus: bounds the time for a tiny threshold.
 SLICES = 128
-# Slices between the numbers of one sheet and those of the next: more than one sheet can have.
+# Difference between the slice numbers of one sheet and those of the next. It exceeds the number
+# of slices that a sheet can have, so that no two sheets share a number.
 APART = 2 * SLICES + 2
 
 
 class Extent(NamedTuple):
-    """How far sprites reach and slices go, as far as it is known when a program is compiled.
+    """The largest sprite and the number of slices, both static (known at compile time).
 
-    - `max_coc`: the largest circle of confusion, pixels.
-    - `slices`: to either side of the focus, `max_coc` over the threshold, rounded up. None if
+    - `max_coc`: the largest diameter of a circle of confusion, pixels.
+    - `slices`: the number on each side of the focus, `max_coc / threshold` rounded up. None if
       the threshold is traced.
     """
 
@@ -58,18 +62,19 @@ class Extent(NamedTuple):
         return reach(self.max_coc)
 
     def reach_of(self, radius: float) -> int:
-        """The same of sprites of at most this radius."""
+        """Like `reach`, for sprites of at most this radius."""
         return reach(min(2 * radius, self.max_coc))
 
 
 class Sheets(NamedTuple):
-    """Layers of sprites that go on by `reach` pixels beyond the frame.
+    """Layers of sprites, one per pixel, padded by `reach` pixels on each side of the frame.
 
-    - `value`: the channels and a one, times the share that is let through, over the area.
+    - `value`: the colour channels and then a 1, all times the share of the sprite that no other
+      layer hides, over the area of its disc.
     - `radius`: pixels.
-    - `tilt`: the derivatives of the logarithm of the defocus along x and y, at most
-      `1 / (radius + 1/2)` together.
-    - `place`: the signed defocus, in slices, at most `SLICES`.
+    - `tilt`: the gradient along x and y of the logarithm of the defocus; its length is at most
+      `1 / (radius + 1/2)`, so that no weight `1 + tilt . offset` is negative.
+    - `place`: the signed defocus over the threshold, that is, in slices; at most `SLICES`.
     """
 
     value: Float[Array, "sheet value height width"]
@@ -79,7 +84,7 @@ class Sheets(NamedTuple):
 
 
 def ordered(place: Float[Array, "sheet height width"]) -> Float[Array, "sheet height width"]:
-    """The places of all sheets on one scale, each sheet behind the one before it."""
+    """Each sprite's `place`, increased so that every sheet lies behind the one before it."""
     apart = jax.lax.stop_gradient(jnp.ceil(place.max()) - jnp.floor(place.min()) + 2)
     return place + apart * jnp.arange(len(place), dtype=place.dtype)[:, None, None]
 
@@ -103,13 +108,19 @@ def share_slope_of(beyond: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 def _begun(
     value: Float[Array, "disc value"],
 ) -> tuple[Float[Array, "disc step"], Float[Array, "disc step"]]:
-    """Steps at the start of a span: of the running sum, and of the pixel that it cuts."""
+    """What the start of a span adds to the running sum, and to the sum's correction.
+
+    The correction is for the pixel in which the span starts, which it covers in part.
+    """
     nothing = jnp.zeros_like(value)
     return jnp.concatenate([value, nothing], axis=1), jnp.concatenate([nothing, value], axis=1)
 
 
 def across_of(reach: int) -> int:
-    """How many pixels along a row a sprite reaches, moved by the largest tilt."""
+    """How many pixels along a row a sprite reaches, its spans moved by the largest tilt.
+
+    The largest tilt moves a span by at most a third of its radius: hence 4/3 of `reach + 1/2`.
+    """
     return -(-4 * (2 * reach + 1) // 6) + 1
 
 
@@ -117,11 +128,13 @@ class _End(NamedTuple):
     """The starts (`side` -1) or the ends (1) of the spans of some discs, in one row of each.
 
     - `row`: offset of the row from the centre of the disc, in pixels.
-    - `cell`: index of the window's cell in which the end lies; `cut`: where in it, 0 to 1.
-    - `facing`: weight of the row by the tilt. `by_tilt`, `by_radius`: derivatives of the place
-      of the end in the tilt along x and in the radius.
-    - `whole`: 1; or 0 for a single tap, which leaves the running sum alone and whose `cut` is
-      its coverage.
+    - `cell`: flat index of the window's pixel in which the end lies.
+    - `cut`: where in that pixel the end lies, 0 at its left border to 1 at its right.
+    - `facing`: the weight of the row, `1 + tilt_y * row`.
+    - `by_tilt`, `by_radius`: derivatives of the x of the end with respect to the tilt along x
+      and to the radius.
+    - `whole`: 1 for spans. 0 for taps (single pixels painted without the running sum): `cut` is
+      then the coverage of the pixel, and `by_tilt` and `by_radius` are its derivatives.
     """
 
     side: int
@@ -138,7 +151,13 @@ class Grid:
     """Sheets divided into blocks, and the window into which a block's spans are painted.
 
     A window is the block with the margin that its sprites can reach. One more row below it
-    takes writes that no one reads.
+    takes writes that are to be discarded.
+
+    - `reach`, `across`: margin of a window along y and along x, pixels.
+    - `sheets`, `values`: the number of sheets, and of values per sprite.
+    - `height`, `width`: of the frame; `padded`: both with the padding of the sheets.
+    - `blocks`: number of blocks down and across; `block`: height and width of one, pixels.
+    - `rows`, `columns`: height and width of a window.
     """
 
     def __init__(self, reach: int, sheets: Sheets):
@@ -156,7 +175,8 @@ class Grid:
     ) -> Float[Array, "block disc plane"]:
         """One row per disc: value, radius, tilt, place, and 1 if it is painted tap by tap.
 
-        The place of a disc that does not count is inf. Given `dot`, the same of a tangent.
+        `place` is inf for a disc that is not painted. Given `dot`, the tangents of `sheets`,
+        the result has the tangents of value, radius, tilt and place instead.
         """
         value, radius, tilt, place = dot or sheets
         by_taps, fill = jnp.zeros_like(place), 0.0
@@ -186,7 +206,7 @@ class Grid:
         return Sheets(planes[:, :v], planes[:, v], planes[:, v + 1 : v + 3], planes[:, v + 3])
 
     def _counts(self, sheets: Sheets) -> Bool[Array, "sheet height width"]:
-        """Mask of the sprites that are let through and reach the frame."""
+        """Mask of the sprites that are not hidden in full and that reach the frame."""
         far = [
             jnp.maximum(
                 jnp.abs(jnp.arange(n, dtype=sheets.radius.dtype) - (n - 1) / 2)
@@ -230,7 +250,7 @@ class Grid:
         discs: Float[Array, "block disc plane"],
         dots: Float[Array, "block disc plane"] | None = None,
     ) -> Float[Array, "value height width"]:
-        """The sum of a slice's sprites in the frame; with `dots`, then its derivative too."""
+        """The sum of a slice's sprites in the frame; with tangents `dots`, then its tangent."""
         v = self.values
         channels = v if dots is None else 2 * v
 
@@ -288,7 +308,10 @@ class Grid:
         bar: Float[Array, "value height width"],
         bars: Float[Array, "block disc plane"],
     ) -> Float[Array, "block disc plane"]:
-        """The adjoint of `paint` at `bar`, added to `bars`: it reads where `paint` writes."""
+        """The adjoint of `paint`: it reads the window where `paint` writes it.
+
+        `bar` is the cotangent of `paint`'s result. The cotangent of `discs` is added to `bars`.
+        """
         v = self.values
         canvas = self._canvas(v, discs.dtype)
         at = (0, 2 * self.reach, self.reach + self.across)
@@ -408,7 +431,7 @@ class Grid:
             width, *slope = (a - b for a, b in zip(upper, lower, strict=True))
             for side, whole, cut, cell, *by in (ends if column is None else tap)(width, slope):
                 for way in (1, -1):
-                    # The middle row is its own mirror image.
+                    # The middle row is its own mirror image: the second write is discarded.
                     there = y + row if way > 0 else jnp.where(row > 0, y - row, self.rows)
                     cells = there * self.columns + cell
                     facing = 1 + (way * height) * tilt_y
@@ -416,6 +439,7 @@ class Grid:
                     carry = visit(carry, end)
             return carry, upper
 
+        # The integral up to -1/2, the lower border of the middle row: it is odd in the height.
         lower = [-z for z in segment_integral(radius, jnp.asarray(0.5, disc.dtype), slopes)]
         rows = jnp.ceil(largest - POINT_RADIUS).astype(int) + 1
         return jax.lax.fori_loop(0, rows, add_row, (carry, lower))[0]
