@@ -43,6 +43,8 @@ LARGEST_COC = 0.025
 FOCAL_PER_WIDTH = 0.5 / math.tan(math.radians(30))
 # Scene units of one step of an integer depth where no scale is given.
 MILLI = 1e-3
+# Options that a depth does not have: with one of them DEPTH is a disparity.
+OF_DISPARITY = ("baseline", "offset", "disparity_scale", "disparity_shift")
 
 
 def number(text: str) -> float:
@@ -125,8 +127,10 @@ def colors(image: np.ndarray) -> np.ndarray:
 
 def read_depth(arguments: argparse.Namespace) -> np.ndarray:
     """Depth in scene units along the axis, height width, float32; NaN where it is missing."""
-    stored = io.read_depth(arguments.depth)
     is_depth = not arguments.disparity
+    if is_depth and (given := [name for name in OF_DISPARITY if getattr(arguments, name)]):
+        raise ValueError(f"--{given[0].replace('_', '-')} must have --disparity")
+    stored = io.read_depth(arguments.depth)
     scale = arguments.depth_scale or (MILLI if is_depth and stored.dtype.kind in "iu" else 1.0)
     if is_depth:
         depth = depths.clean(stored, unit=scale)

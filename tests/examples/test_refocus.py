@@ -118,6 +118,8 @@ def test_a_scale_may_be_a_fraction(photograph, main):
         (("depth.exr",), "`depth.exr` must have one layer with an image and a depth"),
         (("color.png", "depth.png", "--disparity"), "must have --disparity-scale, or --base"),
         (("color.png", "depth.png", "--disparity", "--baseline", "1"), "and --focal of a pair"),
+        (("color.png", "depth.png", "--baseline", "1"), "--baseline must have --disparity"),
+        (("color.png", "depth.png", "--disparity-shift", "1"), "-shift must have --disparity"),
         (("color.png", "depth.png", "--behind", "x"), "must be an OpenEXR file"),
         (
             ("color.png", "depth.png", "--behind", "x", "--method", "scatter"),
