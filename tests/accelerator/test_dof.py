@@ -30,6 +30,7 @@ from tests.dof.test_layered import (  # noqa: F401
     test_a_second_layer_that_is_nowhere_is_none,
     test_a_sharp_edge_before_a_blurred_plane_stays_sharp,
     test_a_slanted_floor_lets_nothing_through,
+    test_discs_inside_their_own_pixel_change_nothing,
 )
 from tests.dof.test_separable import (  # noqa: F401
     test_a_bad_pixel_spoils_its_square,

@@ -88,6 +88,16 @@ def test_a_sharp_edge_before_a_blurred_plane_stays_sharp():
     assert np.abs(one - blurred(wall, RADIUS)[:, right]).max() > 0.03
 
 
+@pytest.mark.parametrize("max_coc", [1e-3, 0.5, 1.0])
+def test_discs_inside_their_own_pixel_change_nothing(max_coc):
+    """The search for the reach of a slice once had no end where that was 0."""
+    rng = np.random.default_rng(0)
+    image, depth = rng.random((5, 6, 2)), rng.uniform(1, 9, (5, 6))
+    lens = ThinLens(10.0, 3.0, 60.0)
+    out = dof.layered(image, depth, lens, max_coc=max_coc)
+    np.testing.assert_allclose(out, image, rtol=1e-12)
+
+
 def test_the_foreground_alone_is_blurred_where_both_planes_are():
     near, wall = np.array([1.0, 0.2, 0.1]), np.array([0.1, 0.6, 0.9])
     image, depth, behind = half_plane(near, 4 / 3, np.broadcast_to(wall, (*SIZE, 3)), 4.0)
