@@ -1,4 +1,4 @@
-"""Separable symmetric filters, and sums over taps that XLA computes as they are meant.
+"""Separable symmetric filters.
 
 A pass reads its image once and writes it once. Its transpose is the same pass, with zeros
 beyond the frame.
@@ -16,16 +16,12 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxfx._linear import linear
-from jaxfx._platform import by_platform
+from jaxfx._xla import added, added_in_groups
 
 
 Sampling = Literal["discrete", "linear"]
 # A pass is a sum over taps, the arrays that `tap(i)` gives; they differ in their offset only.
 Tap = Callable[[int], Array]
-
-# Terms per sum; a term reads two taps. Of more than 16 shifted reads in one sum XLA makes as
-# many copies of the image.
-_GROUP = 8
 
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -133,7 +129,7 @@ def _unpadded(
         start = row + (i - half) * channels
         return lax.slice_in_dim(columns, start, start + height * row)
 
-    whole = _added_in_groups(image, terms(across, moved)).reshape(height, row)
+    whole = added_in_groups(image, terms(across, moved)).reshape(height, row)
 
     edges = [jnp.repeat(image[:, i : i + 1], half, axis=1) for i in (0, width - 1)]
     ends = [image[:, : 2 * half], image[:, width - 2 * half :]]
@@ -143,7 +139,7 @@ def _unpadded(
     def beside(i: int) -> Array:
         return lax.slice_in_dim(sides, i * channels, i * channels + 4 * reach, axis=1)
 
-    sides = _added_in_groups(image, terms(across, beside))
+    sides = added_in_groups(image, terms(across, beside))
 
     # In a loop: outside of one, XLA computes the whole again to put a strip into it.
     def put(i: Array, whole: Array) -> Array:
@@ -164,7 +160,7 @@ def _columns(
     height = flat.shape[0]
     indices = np.arange(height)[:, None] + np.arange(-half, half + 1)
     indices = jnp.asarray(indices.clip(0, height - 1))
-    sums = _added_in_groups(
+    sums = added_in_groups(
         flat, terms(lambda i: flat.at[indices[:, i]].get(mode="promise_in_bounds"))
     )
     return lax.pad(sums, jnp.zeros((), flat.dtype), ((1, 1, 0), (0, 0, 0)))
@@ -220,30 +216,3 @@ def _linear(weights: Float[Array, "taps"], tap: Tap) -> list[Callable[[], Array]
 
 
 _TERMS = {"discrete": discrete_terms, "linear": _linear}
-
-
-def added(terms: list[Callable[[], Array]]) -> Array:
-    """The sum of the terms."""
-    return ft.reduce(jnp.add, [term() for term in terms])
-
-
-def _added_in_groups(image: Array, terms: list[Callable[[], Array]]) -> Array:
-    """The same sum, some terms at a time.
-
-    Of more than 16 shifted reads in one sum XLA makes as many copies of the image.
-    """
-    groups = [terms[i : i + _GROUP] for i in range(0, len(terms), _GROUP)]
-    if len(groups) == 1:
-        return added(terms)
-    return ft.reduce(jnp.add, [apart(image, ft.partial(added, group)) for group in groups])
-
-
-def apart(image: Array, compute: Callable[[], Array]) -> Array:
-    """The result of `compute`, kept in memory: XLA moves nothing across it.
-
-    On a CPU it is a branch that is always taken, for which an accelerator's host would wait.
-    """
-    shape = jax.eval_shape(compute)
-    nothing = lambda: jnp.zeros(shape.shape, shape.dtype)
-    branch = lambda: lax.cond(image.reshape(-1)[0] < -jnp.inf, nothing, compute)
-    return by_platform(cpu=branch, accelerator=lambda: lax.optimization_barrier(compute()))

@@ -36,14 +36,13 @@ from jaxfx._checks import (
 )
 from jaxfx._filter import (
     Sampling,
-    added,
-    apart,
     discrete_terms,
     filter_tangent,
     linear_reads,
     separable,
 )
 from jaxfx._numerics import working_dtype
+from jaxfx._xla import added, apart
 
 
 __all__ = ["LinearTaps", "binomial_weights", "downsample", "gaussian", "linear_taps"]

@@ -24,6 +24,7 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 NUMERICS = {
     *("_arrays", "_checks", "_choice", "_extras", "_filter", "_holes", "_linear", "_numerics"),
     "_platform",
+    "_xla",
     *("_progress", "_pyramid", "_sampling", "_tiles"),
 }
 TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "transfer"}

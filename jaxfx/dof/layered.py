@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, check_depth, check_image, is_concrete, items, parameter
-from jaxfx._numerics import clip01, sum_planes
+from jaxfx._numerics import clip01
+from jaxfx._xla import sum_planes
 from jaxfx.dof.arguments import check_arguments, compiled, defocused, with_own
 from jaxfx.dof.kernels._layers import composited
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float, Num
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check_map, whole_number
 from jaxfx._choice import Choice
-from jaxfx._numerics import safe_divide, sum_planes
+from jaxfx._numerics import safe_divide
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
+from jaxfx._xla import sum_planes
 from jaxfx.camera import Camera, PinholeCamera
 from jaxfx.reproject.arguments import (
     Search,

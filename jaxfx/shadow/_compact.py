@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
+from jaxfx._xla import stored
+
 
 _WORD_BITS = 32
 # Pixels per iteration. Larger chunks waste more work on the last one and need more memory;
@@ -30,8 +32,7 @@ def fold(
     `pixels` are the flat indices of a chunk. In the last chunk, indices past the end of the
     image fill it up; `fetch` gets the last pixel in their place.
 
-    The result of `fetch` is returned by a `lax.cond`, which stores it in memory: otherwise XLA
-    would compute it again for each tap of a filter.
+    The result of `fetch` is stored, or XLA would compute it again for each tap of a filter.
     """
     words = _pack(mask)
     ends = jnp.cumsum(jax.lax.population_count(words).astype(jnp.int32))
@@ -43,10 +44,8 @@ def fold(
         pixels = jnp.where(rank < ends[-1], _nth_set(words, ends, rank), mask.size)
         return pixels, fetch(jnp.minimum(pixels, mask.size - 1))
 
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(load, steps))
-
     def body(k, carry):
-        pixels, fetched = jax.lax.cond(k < steps, load, lambda _: nothing, k)
+        pixels, fetched = stored(k < steps, load, k)
         return step(carry, pixels, fetched)
 
     return jax.lax.fori_loop(0, steps, body, start)

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._filter import apart
 from jaxfx._numerics import absolute, working_dtype
+from jaxfx._xla import apart
 from jaxfx.shadow.receivers import Receivers
 
 

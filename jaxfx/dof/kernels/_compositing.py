@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import sum_planes
+from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._slices import Extent, Sheets
 
 

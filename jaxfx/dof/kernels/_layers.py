@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfx._numerics import clip01, sum_planes
+from jaxfx._numerics import clip01
+from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._adjoint import with_adjoint
 from jaxfx.dof.kernels._compositing import (
     Filling,

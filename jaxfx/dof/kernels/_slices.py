@@ -25,7 +25,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._numerics import clip01, sum_planes
+from jaxfx._numerics import clip01
+from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._paint import _add, _read
 from jaxfx.dof.kernels._spans import _too_bright
 from jaxfx.dof.kernels._tiles import inside

@@ -16,7 +16,8 @@ What it does not do well: below a radius of about eight, `tiles` are quicker.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._numerics import clip01, sum_planes
+from jaxfx._numerics import clip01
+from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels import _tiles
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
 from jaxfx.dof.kernels._paint import paint, read_back

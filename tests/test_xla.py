@@ -1,0 +1,34 @@
+"""The workarounds for XLA compute what the plain forms compute, derivatives included."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxfx._xla
+from benchmarks.xla import reproducers
+
+
+@pytest.mark.parametrize("name", ["apart", "stored", "added_in_groups", "sum_planes"])
+def test_a_workaround_has_the_values_and_derivatives_of_the_plain_form(name):
+    array, plain, ours = reproducers()[name]
+    np.testing.assert_allclose(ours(array), plain(array), rtol=1e-5)
+    total = lambda f: jax.grad(lambda x: jnp.sum(jnp.sin(f(x))))
+    np.testing.assert_allclose(total(ours)(array), total(plain)(array), atol=1e-3)
+
+
+def test_every_workaround_has_a_reproducer():
+    public = {name for name in vars(jaxfx._xla) if not name.startswith("_")}
+    own = {
+        name
+        for name in public
+        if getattr(vars(jaxfx._xla)[name], "__module__", "") == "jaxfx._xla"
+    }
+    assert own - {"added"} == set(reproducers())
+
+
+def test_a_stored_value_that_is_not_needed_is_zero():
+    double = lambda x: {"twice": 2 * x}
+    for is_needed in (True, False):
+        out = jaxfx._xla.stored(jnp.array(is_needed), double, jnp.arange(3.0))
+        np.testing.assert_array_equal(out["twice"], is_needed * 2 * np.arange(3.0))
