@@ -125,8 +125,8 @@ def contenders(multi_pass, pinhole, reprojected, scatter, layered, image, sample
     # The image that scatter is given has its price too, which grows with its antialiasing.
     return (
         {
-            "scatter of a given picture": lambda: scatter(image),
-            "layered of a given picture": lambda: layered(image),
+            "scatter of a given image": lambda: scatter(image),
+            "layered of a given image": lambda: layered(image),
         }
         | {f"{REPROJECTED} {n}": lambda n=n: reprojected(n) for n in (4, 16, 64)}
         | {f"{WHOLE} {n}": lambda n=n: scatter(pinhole(n)) for n in (1, 4, PINHOLE_PASSES)}
@@ -144,10 +144,10 @@ def draw_chart(measurements, title: str, path: Path) -> None:
     save(figure, path)
 
 
-def draw_fit(pictures: dict, losses, path: Path) -> None:
+def draw_fit(images: dict, losses, path: Path) -> None:
     figure, axes = plt.subplots(2, 3, figsize=(12, 8.4), layout="constrained")
-    for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
-        ax.imshow(io.srgb_from_linear(np.clip(np.asarray(picture), 0, 1)))
+    for ax, (title, image) in zip(axes.flat, images.items(), strict=False):
+        ax.imshow(io.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
         ax.set_title(title)
         ax.set_axis_off()
     ax, losses = axes.flat[-1], np.asarray(losses)
@@ -220,22 +220,19 @@ def main() -> None:
     fitted = fit.dof(reference.image, image, filled, throw=False, progress=True, **start)
     exr.write(out / "fitted.exr", {"": fitted.image, "depth": depth})
 
-    pictures = {
+    images = {
         "pinhole": image,
         "start": dof.scatter(image, filled, **start),
         "fitted": fitted.image,
     }
-    psnr = {
-        name: float(metrics.psnr(picture, reference.image))
-        for name, picture in pictures.items()
-    }
-    titles = {name: f"{name}, {psnr[name]:.1f} dB" for name in pictures}
+    psnr = {name: float(metrics.psnr(image, reference.image)) for name, image in images.items()}
+    titles = {name: f"{name}, {psnr[name]:.1f} dB" for name in images}
     draw_fit(
         {
             titles["pinhole"]: image,
             f"reference, {samples} passes": reference.image,
             titles["fitted"]: fitted.image,
-            titles["start"]: pictures["start"],
+            titles["start"]: images["start"],
             "fitted, 4 times its error": 4 * jnp.abs(fitted.image - reference.image),
         },
         fitted.losses,
@@ -299,7 +296,7 @@ def main() -> None:
     print_table(report)
     text = json.dumps(strict(report), indent=2, allow_nan=False)
     write_whole(out / "report.json", text.encode())
-    print(f"{report['seconds']:.0f} s; pictures and report in {out}")
+    print(f"{report['seconds']:.0f} s; images and report in {out}")
 
 
 if __name__ == "__main__":

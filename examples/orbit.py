@@ -30,9 +30,9 @@ def parse() -> argparse.Namespace:
     )
     given = parser.add_mutually_exclusive_group()
     given.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
-    given.add_argument("--picture", type=Path, help="an EXR file with color and `depth`")
+    given.add_argument("--image", type=Path, help="an EXR file with color and `depth`")
     parser.add_argument("--size", type=int, default=256, help="side of a mesh's image, pixels")
-    parser.add_argument("--fov", type=float, default=45.0, help="of --picture, degrees")
+    parser.add_argument("--fov", type=float, default=45.0, help="of --image, degrees")
     parser.add_argument("--degrees", type=float, default=6.0, help="to either side")
     parser.add_argument("--frames", type=int, default=24, help="of the GIF")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
@@ -48,8 +48,8 @@ def parse() -> argparse.Namespace:
 def load(arguments: argparse.Namespace):
     """The image, its depth, its camera and, for a mesh, a function from camera to image."""
     try:
-        if arguments.picture is not None:
-            channels = exr.read(arguments.picture)
+        if arguments.image is not None:
+            channels = exr.read(arguments.image)
             image, depth = jnp.asarray(channels[""]), jnp.asarray(channels["depth"])
             fov, (height, width) = np.deg2rad(arguments.fov), depth.shape
             return image, depth, PinholeCamera.from_fov(fov, height=height, width=width), None
@@ -63,7 +63,7 @@ def load(arguments: argparse.Namespace):
 
         return *rendered(eye), eye, lambda eye: rendered(eye)[0]
     except KeyError as error:
-        fail(f"--picture must hold color and `depth`, it lacks {error}")
+        fail(f"--image must hold color and `depth`, it lacks {error}")
     except (OSError, ValueError, RuntimeError) as error:
         fail(error)
 

@@ -187,7 +187,7 @@ def blurred(stage: Stage, image, depth, lens: ThinLens) -> Image:
     return dof.scatter(image, depth, lens, max_coc=stage.max_coc)
 
 
-def picture(numbers: Numbers, stage: Stage, cast: Shadow) -> Image:
+def whole_image(numbers: Numbers, stage: Stage, cast: Shadow) -> Image:
     """The whole pipeline, from the parameters to the image."""
     camera = stage.camera(numbers)
     gbuffer = new_view(stage, camera)
@@ -195,14 +195,14 @@ def picture(numbers: Numbers, stage: Stage, cast: Shadow) -> Image:
     return blurred(stage, image, gbuffer.depth, stage.lens(numbers))
 
 
-draw = eqx.filter_jit(picture)
+draw = eqx.filter_jit(whole_image)
 
 
 def residual(numbers: Numbers, stage: Stage, cast: Shadow, target, sigma) -> Image:
     """The image less the target, blurred by a Gaussian of `sigma` pixels that wraps around."""
     down, across = (jnp.fft.fftfreq(n)[:, None] for n in stage.shape)
     low = jnp.exp(-2 * (jnp.pi * sigma) ** 2 * (down**2 + (across**2).T))
-    difference = jnp.fft.fft2(picture(numbers, stage, cast) - target, axes=(0, 1))
+    difference = jnp.fft.fft2(whole_image(numbers, stage, cast) - target, axes=(0, 1))
     return jnp.fft.ifft2(low[..., None].astype(complex) * difference, axes=(0, 1)).real
 
 
@@ -333,7 +333,7 @@ def times_of(numbers: Numbers, stage: Stage, cast: Shadow, target: Image) -> tup
         "depth of field": lambda: blurred(
             stage, given["light and shadow"], given["new view"].depth, lens
         ),
-        "picture": lambda: draw(numbers, stage, cast),
+        "whole image": lambda: draw(numbers, stage, cast),
         "13 derivatives, forward": lambda: forward(numbers, *rest),
         "gradient, reverse": lambda: reverse(numbers, *rest),
     }
@@ -364,7 +364,9 @@ def main() -> None:
     _pipeline.write_panels(out / "derivatives.png", images)
 
     noise = np.random.default_rng(seed).normal(0, arguments.noise, image.shape)
-    target = (from_mesh if arguments.of_mesh else given["picture"]) + jnp.asarray(noise, float)
+    target = (from_mesh if arguments.of_mesh else given["whole image"]) + jnp.asarray(
+        noise, float
+    )
     starts, found = {}, {}
     for index in range(arguments.starts):
         signs = np.random.default_rng(seed + index).choice([-1, 1], 13)
@@ -398,7 +400,7 @@ def main() -> None:
     for name, went in report["searches"].items():
         print(name + ", ".join(f" {key} {value:.3g}" for key, value in went.items()))
     print(f"hardest to tell apart: {hardest}\n{_pipeline.IF_NOISE}")
-    print(f"pictures and report in {out}")
+    print(f"images and report in {out}")
 
 
 if __name__ == "__main__":

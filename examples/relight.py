@@ -219,7 +219,7 @@ def play(studio: Studio, frames: int) -> tuple[list, list]:
     for _ in range(2):  # The second time nothing is left to compile.
         studio.view(stage.turned(0.0, 0.02), first, Clock())
         studio.move(first, Clock())
-    pictures, records = [], []
+    images, records = [], []
     for frame in range(frames):
         clock, kind = Clock(), "edit" if frame < half else "new view"
         if frame < half:
@@ -229,7 +229,7 @@ def play(studio: Studio, frames: int) -> tuple[list, list]:
             phase = 2 * np.pi * (frame - half) / (frames - half)
             camera = stage.turned(TURN * np.sin(phase), 0.02 + 0.03 * (1 - np.cos(phase)))
             image, holes = studio.view(camera, first, clock)
-        pictures.append(np.asarray(image))
+        images.append(np.asarray(image))
         records.append(
             {
                 "kind": kind,
@@ -239,7 +239,7 @@ def play(studio: Studio, frames: int) -> tuple[list, list]:
                 "psnr": psnr_to_fresh_cache(studio, image),
             }
         )
-    return pictures, records
+    return images, records
 
 
 def psnr_to_fresh_cache(studio: Studio, image) -> float:
@@ -252,28 +252,28 @@ def psnr_to_fresh_cache(studio: Studio, image) -> float:
     return float(metrics.psnr(image, fresh))
 
 
-def to_bytes(picture) -> np.ndarray:
-    return np.rint(255 * io.srgb_from_linear(np.clip(picture, 0, 1))).astype(np.uint8)
+def to_bytes(image) -> np.ndarray:
+    return np.rint(255 * io.srgb_from_linear(np.clip(image, 0, 1))).astype(np.uint8)
 
 
-def write_gif(pictures, path: Path) -> None:
+def write_gif(images, path: Path) -> None:
     first, *rest = (
-        Image.fromarray(to_bytes(picture)).quantize(128, dither=Image.Dither.NONE)
-        for picture in pictures
+        Image.fromarray(to_bytes(image)).quantize(128, dither=Image.Dither.NONE)
+        for image in images
     )
     buffer = BytesIO()
     first.save(buffer, "GIF", save_all=True, append_images=rest, duration=80, loop=0)
     write_whole(path, buffer.getvalue())
 
 
-def write_sheet(pictures, records, path: Path) -> None:
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, 12).astype(int))
+def write_sheet(images, records, path: Path) -> None:
+    chosen = np.unique(np.linspace(0, len(images) - 1, 12).astype(int))
     figure, axes = plt.subplots(3, 4, figsize=(12, 7.6), layout="constrained")
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, i in zip(axes.flat, chosen, strict=False):
         record = records[i]
-        ax.imshow(to_bytes(pictures[i]))
+        ax.imshow(to_bytes(images[i]))
         ax.set_title(
             f"{record['kind']}: {record['milliseconds']:.0f} ms, {record['psnr']:.0f} dB",
             fontsize=9,
@@ -307,9 +307,9 @@ def main() -> None:
     logging.getLogger("jaxfx").setLevel(logging.INFO)
     out = make_folder(arguments.out)
     studio = Studio(set_stage(arguments.scene, arguments.size), arguments.depth)
-    pictures, records = play(studio, arguments.frames)
-    write_gif(pictures, out / "relight.gif")
-    write_sheet(pictures, records, out / "sheet.png")
+    images, records = play(studio, arguments.frames)
+    write_gif(images, out / "relight.gif")
+    write_sheet(images, records, out / "sheet.png")
     report = {
         "size": [studio.stage.height, studio.stage.width],
         "depth": arguments.depth,
@@ -321,7 +321,7 @@ def main() -> None:
     for kind, median in report["median"].items():
         steps = ", ".join(f"{name} {value:.1f}" for name, value in median["steps"].items())
         print(f"{kind:9}{median['milliseconds']:7.1f} ms ({steps}), {median['psnr']:.1f} dB")
-    print(f"pictures and report in {out}")
+    print(f"images and report in {out}")
 
 
 if __name__ == "__main__":

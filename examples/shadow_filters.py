@@ -238,7 +238,7 @@ def main() -> None:
             f"{record['filter']:3} {record['method']:12}{record['milliseconds']:8.1f} ms"
             f"{record['comparisons']:14,} comparisons{record['differing']:8,} pixels differ"
         )
-    print(f"pictures and report in {out}")
+    print(f"images and report in {out}")
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ show(
 #
 # $$w = \frac{(66, 220, 495, 792, 924, 792, 495, 220, 66)}{4070}.$$
 #
-# Divided by the whole row's 4096, every pass would darken the picture to
+# Divided by the whole row's 4096, every pass would darken the image to
 # $(4070/4096)^2 = 98.7\,\%$: nine passes to 89 %.
 
 # %%
@@ -85,7 +85,7 @@ print(*(f"{float(jnp.mean(x)):.4f}" for x in (image, kept, darkened)))
 #
 # `sigma` is a parameter as any other: traced, with a derivative, in pixels and of all passes
 # together. A number sets the taps too, 4 sigma to each side; a traced one can't, so that they
-# are given. Here it is found again from a blurred picture by Newton's method.
+# are given. Here it is found again from a blurred image by Newton's method.
 
 # %%
 blurred = blur.gaussian(image, taps=15, sigma=1.7)
@@ -155,7 +155,7 @@ print(f"largest difference after nine passes: {float(abs(discrete - linear).max(
 #   offset.
 #
 # Fetches are counted per pixel, as the GPU's author counts them. Bytes are those that must
-# move if nothing but a few rows stays in the cache: a pass reads the picture once and writes it
+# move if nothing but a few rows stays in the cache: a pass reads the image once and writes it
 # once.
 
 # %%
@@ -199,7 +199,7 @@ def seconds(function, repeats):
     return statistics.median(times)
 
 
-# A name, fetches of a pixel, passes over the picture, seconds.
+# A name, fetches of a pixel, passes over the image, seconds.
 table = [
     ("direct, 33 x 33", 33 * 33, 1, seconds(direct, 1)),
     ("separable, 33", 2 * 33, 2, seconds(lambda x: blur.gaussian(x, taps=33, row=48), 5)),
@@ -245,16 +245,16 @@ plt.show()
 # to within the machine's noise, since both wait for memory. As a gather, which is how one would
 # port the shader, every read computes four addresses a pixel and takes its time. And 33 taps at
 # once move the fewest bytes of all that is separable, but not four times fewer: of more than 16
-# shifted reads in one sum XLA makes as many copies of the picture, so they are added in groups,
-# each of which writes a picture and has it read again.
+# shifted reads in one sum XLA makes as many copies of the image, so they are added in groups,
+# each of which writes an image and has it read again.
 #
 # What did help, each seen in the compiled text before it was believed:
 #
 # - **Separability**, as ever.
-# - **No copy with a margin.** Rows are named by their index, held within the picture; along a
-#   row a tap is the flat picture moved by some pixels; what runs on into the next row is put
+# - **No copy with a margin.** Rows are named by their index, held within the image; along a
+#   row a tap is the flat image moved by some pixels; what runs on into the next row is put
 #   right in two strips.
-# - **Two passes, not one of 81 taps.** XLA would fuse both passes and compute the first anew
+# - **Two passes, not one of 81 taps.** XLA would fuse both passes and compute the first again
 #   for every tap of the second. It keeps in memory what has been padded: one row above and one
 #   below are enough.
 # - **Symmetry**: two taps of one weight are added first.
@@ -276,7 +276,7 @@ print("fused loops of the compiled program:", *loops, sep="\n  ")
 # - **In bytes**: rounded to 8 bits after each pass a faint slope turns to steps; in floats it
 #   does not. Blur in linear light, and round once.
 # - **At the border** the nearest pixel is repeated, which gives it more weight than the others:
-#   the sum over the picture is not kept.
+#   the sum over the image is not kept.
 # - **Across depth**: it knows no edges. For a lens, see `dof`.
 
 # %%

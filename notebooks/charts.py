@@ -54,13 +54,13 @@ def show(*names):
 show("dof_time_still_life", "dof_time_fence")
 
 # %% [markdown]
-# Depth of field, given a picture and its depth; multi-pass alone sees the scene.
+# Depth of field, given an image and its depth; multi-pass alone sees the scene.
 #
 # - **Read along the front.** Each step up must be paid for. `blend` is the cheapest; the
 #   kernels of `scatter` are one method at several prices, in one row; `layered` with a second
 #   layer of depth is as exact as some thirty passes, for a tenth of their time.
 # - **The scenes disagree**, and the second is there for that. Behind a fence out of focus lies
-#   what no single picture holds: one layer, scatter and all of their kin end within four
+#   what no single image holds: one layer, scatter and all of their kin end within four
 #   decibels of one another, and only a second layer or more passes get further.
 # - **More effort is no less error** for `gather`: more taps draw the same wrong disc more
 #   finely.
@@ -72,8 +72,8 @@ show("dof_own", "dof_memory_still_life")
 
 # %% [markdown]
 # The same against the largest circle: who grows with its area, who with its radius, and who
-# not at all. Lines that meet in the left picture change places there. Memory is that of one
-# compiled program beside its arguments and its picture; of multi-pass, which is many programs
+# not at all. Lines that meet in the left image change places there. Memory is that of one
+# compiled program beside its arguments and its image; of multi-pass, which is many programs
 # and a renderer, it is not known, and the chart says so.
 
 # %%
@@ -83,13 +83,13 @@ show("shadow_own", "relight_own")
 # - **Shadows** against 36 rays to a square lamp. A filter of fixed width is right at one
 #   distance from what casts the shadow, so a wider one is a worse one here; `pcss`, whose
 #   width follows the penumbra, is best at every size. What is masked (`edges by depth`) gives
-#   the picture of the full filter, to the last bit, for less time as the filter grows.
-# - **Relighting**: a picture of $n$ lights costs $n$; an edit of one of them costs the same
+#   the image of the full filter, to the last bit, for less time as the filter grows.
+# - **Relighting**: an image of $n$ lights costs $n$; an edit of one of them costs the same
 #   whatever $n$ is. 80 dB stands for that and more: here, for rounding.
 #
 # ## How it is measured
 #
-# For a method's picture $\hat I$ and the reference $I$, over the pixels and channels that
+# For a method's image $\hat I$ and the reference $I$, over the pixels and channels that
 # count,
 #
 # $$\text{RMSE} = \sqrt{\operatorname{mean}\,(\hat I - I)^2}, \qquad
@@ -98,7 +98,7 @@ show("shadow_own", "relight_own")
 # Each method is compiled ahead of time, called once, then timed until it is waited for: the
 # median of up to 11 calls or 0.4 seconds. The bar is from the quickest call to the slowest,
 # about the median. $a$ beats $b$ if it is no slower and no less exact, and either quicker or
-# more exact. Here is the whole of it on a picture of random discs:
+# more exact. Here is the whole of it on an image of random discs:
 
 # %%
 rng = np.random.default_rng(0)
@@ -139,7 +139,7 @@ for times in zip(*found, strict=True):
 #
 # ## What such a chart cannot say
 #
-# **Which error.** The same pictures by three scores: here they agree on the order, and not on
+# **Which error.** The same images by three scores: here they agree on the order, and not on
 # the distances.
 
 # %%
@@ -157,7 +157,7 @@ for name, method in methods.items():
     )
 
 # %% [markdown]
-# **What was left out.** A warped picture has holes, and says where. The chart counts them as
+# **What was left out.** A warped image has holes, and says where. The chart counts them as
 # right, so a method that draws less errs less. The share that each draws belongs beside it:
 
 # %%
@@ -171,10 +171,10 @@ for method in atlas_cases.SEARCHES:
 # %% [markdown]
 # - **Another machine.** Ratios of times change with cores, caches and memory, and a GPU would
 #   turn some of them round. The margin says where a chart is from; `python -m benchmarks.atlas`
-#   draws it anew in under ten minutes.
+#   draws it again in under ten minutes.
 # - **Another scene.** Two were measured, one of them made to fail. Which is like yours is not
 #   on the chart; `budget` asks your scene itself.
-# - **The whole price.** Given pictures cost nothing here; compiling, which takes seconds, is
+# - **The whole price.** Given images cost nothing here; compiling, which takes seconds, is
 #   not in the time, and arguments and results are not in the memory.
 # - **The gradient.** Some are exact, some lack what visibility has, two may be as quick
 #   forward and not backward: each docstring's **Gradient** line, and the benchmarks, say that.

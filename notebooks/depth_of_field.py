@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Depth of field, by every method
 #
-# One picture, its depth and a lens go in: `(image, depth, lens, *, max_coc)`. All methods
+# One image, its depth and a lens go in: `(image, depth, lens, *, max_coc)`. All methods
 # take the diameter $C$ of a pixel's circle of confusion from the lens, $C = E f\,|1/Z_f -
-# 1/Z|$, and differ in who spreads what over whom. The reference is the mean of 128 pictures
+# 1/Z|$, and differ in who spreads what over whom. The reference is the mean of 128 images
 # of the scene itself, from all over the lens.
 
 # %%
@@ -58,7 +58,7 @@ def passes(aperture, samples):
 
 
 reference, convergence = passes(lens.aperture, SAMPLES)
-image, _ = passes(0.0, 16)  # a pinhole picture, antialiased as the reference is
+image, _ = passes(0.0, 16)  # a pinhole image, antialiased as the reference is
 print(f"the reference's own error is about {float(convergence):.4f}")
 
 
@@ -108,7 +108,7 @@ show({name: picture[crop] for name, picture in pictures.items()}, columns=5, siz
 #   arrives, it takes $\min(a_k,\; 1 - \text{filled})$. A sprite's share counts how its surface
 #   is turned, so that the shares of a slanted floor add up to one.
 # - `separable` has sprites on a line, along rows and then along columns: a square for a disc.
-# - `gather` reads 8 taps on $q$'s own circle, each mixed with a quarter-resolution picture by
+# - `gather` reads 8 taps on $q$'s own circle, each mixed with a quarter-resolution image by
 #   its blurriness; one in front of $q$ counts by its blurriness.
 # - `blend` is $\mathrm{lerp}(I, B, C/C_{\max})$, with $B$ two blurs of 13 taps.
 # - `anisotropic_diffusion` is $\partial I/\partial t = \nabla\!\cdot(g\,\nabla I)$ with $g =
@@ -118,11 +118,11 @@ show({name: picture[crop] for name, picture in pictures.items()}, columns=5, siz
 #
 # ## Speed against accuracy
 #
-# Time of a picture at this size against PSNR to the reference; beside it the PSNR in the band
+# Time of an image at this size against PSNR to the reference; beside it the PSNR in the band
 # of one largest radius about the edges in depth, where methods differ most, and the most memory
 # that the compiled program asks for beside its arguments. What a method does with the pinhole
-# picture is all that is timed; the second layer is drawn beforehand. The peer of them all is
-# the multi-pass picture of few passes, rendering included.
+# image is all that is timed; the second layer is drawn beforehand. The peer of them all is
+# the multi-pass image of few passes, rendering included.
 
 # %%
 inverse = 1 / jnp.asarray(depth)
@@ -244,7 +244,7 @@ right.grid(alpha=0.3)
 plt.show()
 
 # %% [markdown]
-# `fit.dof(effect="layered")` fits it to one picture. The curve is flat and has a hollow or two,
+# `fit.dof(effect="layered")` fits it to one image. The curve is flat and has a hollow or two,
 # so such a search stays near its start.
 #
 # ## Time and radius
@@ -284,7 +284,7 @@ plt.show()
 # `stability.ipynb` has the figures of every method in every case, to which the tests hold them.
 # Here are the cases with something to see, 46 pixels wide: a white half-plane before a black
 # one, both ways; a dim bar of 3 pixels before a bright field; a slanted plane. The last row is
-# the multi-pass reference, the line below each picture its middle row, over the truth.
+# the multi-pass reference, the line below each image its middle row, over the truth.
 
 # %%
 cases = {name: several[-1] for name, several in dof_cases.scenes().items()}
@@ -321,7 +321,7 @@ plt.show()
 # ## What none of them can do
 #
 # - All but the reference see one surface a pixel. Inside the edge of a blurred foreground the
-#   lens looks past it, at what the picture does not hold: no method of one layer gets
+#   lens looks past it, at what the image does not hold: no method of one layer gets
 #   *blurred foreground* right, and `depth_sorted` and `layered`, exact outside the edge, fail
 #   inside it as well. Two layers are what `layered(behind=...)` is for.
 # - What no layer shows, `layered` guesses from what lies behind, and two edges one before the
@@ -330,8 +330,8 @@ plt.show()
 #   never jump and lose nothing to rounding; and a blurred foreground keeps its outline as if
 #   cut out.
 # - `gather` reads over the circle of the pixel where it stands: its blurred foreground ends
-#   at its outline too, and its eight taps show, as does the picture of a point.
-# - `blend` blurs all by one width and fades it in, so that the sharp picture shines through
+#   at its outline too, and its eight taps show, as does the image of a point.
+# - `blend` blurs all by one width and fades it in, so that the sharp image shines through
 #   what is a little out of focus; the halo of what is in focus lies on all that is not.
 # - `separable` makes squares of highlights, and corners leak where the second pass spreads
 #   what the first has mixed.

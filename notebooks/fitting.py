@@ -11,10 +11,10 @@
 # ---
 
 # %% [markdown]
-# # What made this picture?
+# # What made this image?
 #
-# Every effect here is a differentiable function of its parameters, so a picture can be asked
-# for them: least squares between the effect's output and the picture. `fit.dof` asks for a
+# Every effect here is a differentiable function of its parameters, so an image can be asked
+# for them: least squares between the effect's output and the image. `fit.dof` asks for a
 # lens, as `examples/fit_lens.py` shows; `fit.lights`, here, for the lights.
 
 # %%
@@ -61,7 +61,7 @@ def show(**pictures):
 # %% [markdown]
 # ## Three lights
 #
-# A picture under lights $i$ of colour $c_i$ and geometry $\theta_i$ is $I = \sum_i c_i\,
+# An image under lights $i$ of colour $c_i$ and geometry $\theta_i$ is $I = \sum_i c_i\,
 # B_i(\theta_i)$: linear in the colours. So the colours are never searched. For any geometry
 # the best are the solution of a small linear system, and Levenberg-Marquardt walks over the
 # geometry alone:
@@ -103,7 +103,7 @@ print(f"{len(fitted.losses)} losses, from {fitted.losses[0]:.1e} to {fitted.loss
 # %% [markdown]
 # Some lights can't be told apart, whatever the search does. On a wall that is matt and flat,
 # every sun is the same as every other, and as the sky. `indistinct` names such groups: lights
-# whose parameters can change together without the picture changing. Such a fit is no success,
+# whose parameters can change together without the image changing. Such a fit is no success,
 # and raises unless `throw=False`; `doubt` says why.
 
 # %%
@@ -288,4 +288,4 @@ show(photograph=target, start=photograph(still, wrong), fitted=fitted.image)
 # - See an occluder that its light did not see: the first of two things behind one another
 #   hides the second until the map is rendered again.
 # - Know how many lights there are, or that a colour can't be negative: it takes what it is
-#   given and says in `indistinct` and `standard_errors` what the picture could not tell.
+#   given and says in `indistinct` and `standard_errors` what the image could not tell.

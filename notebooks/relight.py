@@ -14,7 +14,7 @@
 # # Relighting from a deep frame buffer
 #
 # What no light changes is kept for every pixel: reflectances, normal, depth, roughness, the
-# shader. A change of light shades those again. The cost follows the picture's size, not the
+# shader. A change of light shades those again. The cost follows the image's size, not the
 # scene's.
 
 # %%
@@ -134,8 +134,8 @@ for name, image in (("kept", kept_image), ("plain", plain_image)):
 # %% [markdown]
 # ## A light on sliders
 #
-# 640 x 480. In a live notebook the picture follows the sliders; the printed figure is the time
-# from a slider's value to the bytes of the picture.
+# 640 x 480. In a live notebook the image follows the sliders; the printed figure is the time
+# from a slider's value to the bytes of the image.
 
 # %%
 import ipywidgets as widgets
@@ -160,7 +160,7 @@ to_bytes = jax.jit(
 
 
 def picture(x, y, z, strength):
-    """The picture with the light there, as JPEG."""
+    """The image with the light there, as JPEG."""
     color = np.array([1.0, 0.85, 0.6], np.float32) * strength
     light = PointLight(np.array([x, y, z], np.float32), color)
     stream = BytesIO()
@@ -258,7 +258,7 @@ truths = [scene.gbuffer(mesh, target, **small_size) for target in targets]
 
 
 def scores(gbuffers, cameras, weighting="equal"):
-    """PSNR of the relit picture and the share of the view that is seen, at each angle."""
+    """PSNR of the relit image and the share of the view that is seen, at each angle."""
     for target, truth in zip(targets, truths, strict=True):
         found, views = relight.synthesize(
             gbuffers, cameras, target, depth=truth.depth, weighting=weighting
@@ -338,7 +338,7 @@ pictures(
 # Mitsuba's direct light on the same meshes, every surface Lambert, under a directional, a point
 # and a spot light; one ray through each pixel's centre. But for pixels whose centre lies on an
 # edge the two are the same to rounding; unfiltered shadow maps miss the rims of shadows by
-# their texels. `python -m benchmarks.relight_charts --out docs` makes this picture and
+# their texels. `python -m benchmarks.relight_charts --out docs` makes this image and
 # the next chart.
 
 # %%
@@ -382,9 +382,9 @@ display(Picture(root / "docs/relight_bounce.png"))
 # its square root, unless the rank is too small: 64 will do for a thousand points.
 
 # %% [markdown]
-# ## Against rendering anew
+# ## Against rendering again
 #
-# The same picture from the mesh: Embree finds what each pixel shows, and one shadow ray goes to
+# The same image from the mesh: Embree finds what each pixel shows, and one shadow ray goes to
 # each light. The ratio grows with the lights, for an edit does not know how many there are.
 
 

@@ -11,12 +11,12 @@
 # ---
 
 # %% [markdown]
-# # Reprojection: one picture with its depth, from other cameras
+# # Reprojection: one image with its depth, from other cameras
 #
-# A picture, its depth and its camera go in, and another camera:
+# An image, its depth and its camera go in, and another camera:
 # `warp(image, depth, source, target)`. Each pixel of the target sends its ray through the
-# source's depth map, and reads the picture where it meets a surface. Above what it shows, with
-# hatching where it knows nothing; below the scene rendered anew.
+# source's depth map, and reads the image where it meets a surface. Above what it shows, with
+# hatching where it knows nothing; below the scene rendered again.
 
 # %%
 import functools
@@ -201,7 +201,7 @@ plt.show()
 
 # %% [markdown]
 # The price of being exact: at a slant a ray looks at more texels, by the logarithm of its way.
-# Rays through hills with discs before them, the depth taken to be as deep as the picture is
+# Rays through hills with discs before them, the depth taken to be as deep as the image is
 # wide.
 
 # %%
@@ -225,10 +225,10 @@ plt.show()
 # %% [markdown]
 # ## Against the truth, and beside two peers
 #
-# `backward` is told the target's depth, and reads the picture where each point lies: it draws
+# `backward` is told the target's depth, and reads the image where each point lies: it draws
 # what the source did not see in the colour of what hid it. `mesh` makes two triangles of every
 # four texels, none across a step in depth, and traces them by Embree. Of what is visible in
-# both, the PSNR; and of the whole picture, what is drawn that was not seen (false hits), what
+# both, the PSNR; and of the whole image, what is drawn that was not seen (false hits), what
 # is left empty that was seen (false holes) and what is drawn.
 
 # %%
@@ -269,7 +269,7 @@ for name, run in peers.items():
 # %% [markdown]
 # ## Depth of field by reprojection
 #
-# `dof.accumulate` takes any renderer. Given `warp` of a single picture it needs no scene: each
+# `dof.accumulate` takes any renderer. Given `warp` of a single image it needs no scene: each
 # pass carries its alpha along, and the mean is divided by it. Beside `scatter` and `layered`,
 # against 64 renderings of the scene itself:
 
@@ -319,12 +319,12 @@ print(f"{'sharp':12}{'':11}{float(metrics.psnr(sharp, reference)):8.2f} dB")
 #
 # - It knows one layer. What the source did not see stays empty; `blend` fills it from several
 #   sources and `choose` finds the few that show most, and what none saw is not made up.
-# - Surfaces have no thickness that one picture could tell: a column has no end, so that a rod
+# - Surfaces have no thickness that one image could tell: a column has no end, so that a rod
 #   in front takes away all that a ray passes on its way behind it, though the source may have
 #   seen it. The false holes above are this, and grow with the turn.
-# - The picture is read, not rendered: its sharpness, aliasing and highlights are the source's,
+# - The image is read, not rendered: its sharpness, aliasing and highlights are the source's,
 #   and a surface seen at grazing by the source is stretched.
 # - `hole_threshold` decides what is one surface. A slope steeper than it breaks into holes, a
 #   step smaller than it is bridged.
-# - Derivatives in depth, cameras and picture hold for the point that a pixel shows. What comes
+# - Derivatives in depth, cameras and image hold for the point that a pixel shows. What comes
 #   into sight or goes out of it has none: `fit.camera` leaves silhouettes out for that reason.

@@ -242,7 +242,7 @@ plt.show()
 #
 # A plate four texels wide, at several magnifications (pixels a texel), a 7 x 7 filter: the
 # share of the penumbra that is left hard, against the dilation. Edges have to reach half a
-# filter as the picture shows it, so that one dilation does not serve two magnifications.
+# filter as the image shows it, so that one dilation does not serve two magnifications.
 
 # %%
 figure, ax = plt.subplots(figsize=(6, 3), layout="constrained")
@@ -289,7 +289,7 @@ pictures(
 # ## Why a search needs softness
 #
 # Boxes from above: only their shadow tells where the sun is. The loss is the mean squared
-# difference from the true visibility, with the map rendered anew at every angle. From afar
+# difference from the true visibility, with the map rendered again at every angle. From afar
 # every loss leans towards the sun. Close up the hard one is a staircase, with a step for each
 # pixel that flips: its derivative is zero wherever it has one, and a search has nothing to
 # follow. A soft one has a derivative. Its small bumps are those of the maps: within a round of
@@ -359,7 +359,7 @@ print(f"{boxes.miss(start[1]):.0f} degrees at first, {boxes.miss(found.lights[1]
 # - PCF blurs all edges alike. `pcss` takes the mean blocker for all of them: where blockers lie
 #   over one another it leaks, and a penumbra wider than its filter is cut.
 # - `variance` leaks light where occluders lie over one another.
-# - The screen mask loses shadows between pixels, and one dilation serves the whole picture:
+# - The screen mask loses shadows between pixels, and one dilation serves the whole image:
 #   where light grazes a surface a filter covers ever more pixels.
 # - The mask by depth reads the whole map: with few receivers and a large map, filter
 #   everywhere.

@@ -14,12 +14,12 @@
 # # Where every method fails
 #
 # One row is a case in which methods of an effect fail, in the literature or here. Each small
-# picture is what one method makes of it, in the order in which the sections below list them;
+# image is what one method makes of it, in the order in which the sections below list them;
 # red marks what is wrong, missing or not a number. *Pass* counts the methods whose figures are
 # all within what the case asks. The last column is about derivatives, as they are in that case:
 #
 # - **zero**: that of what is computed is 0, and nothing can be fitted through it;
-# - **biased**: there is a derivative, but not that of what the picture should be;
+# - **biased**: there is a derivative, but not that of what the image should be;
 # - **missing**: the true one has a part, of what jumps or comes into sight, that ours lacks;
 # - **none**: integers, files, and peers that are not differentiated.
 
@@ -44,8 +44,8 @@ HTML(stability.overview())
 #
 # ## Depth of field
 #
-# Pictures of 46 x 46 pixels, circles of at most 12. *Bias* is the error of the derivative in
-# the logarithm of the aperture against the closed form's, over the same band as the picture's
+# Images of 46 x 46 pixels, circles of at most 12. *Bias* is the error of the derivative in
+# the logarithm of the aperture against the closed form's, over the same band as the image's
 # error; *gradient* is how far derivatives in aperture, focus and depth lie outside the method's
 # own two one-sided difference quotients.
 
@@ -80,13 +80,13 @@ HTML(stability.section("relight"))
 # ## What the table cannot tell
 #
 # - **Which method to take.** A figure is that of one small scene, chosen so that something goes
-#   wrong in it. How often it does in your pictures, and what a method costs, is what the charts
+#   wrong in it. How often it does in your images, and what a method costs, is what the charts
 #   of each effect are for.
-# - **Whether a pass is a proof.** It says that one picture was within a bound. What holds for
-#   all pictures is tested elsewhere, on random ones: that a kernel's sums are those of a plain
+# - **Whether a pass is a proof.** It says that one image was within a bound. What holds for
+#   all images is tested elsewhere, on random ones: that a kernel's sums are those of a plain
 #   loop, that a bad pixel stays local, that a derivative is the difference quotient.
 # - **What a bound is worth.** Those that equations give (energy, centroid, a mask that misses
-#   nothing) are what they should be. Those of pictures (an error of 0.02 in a band, a share of
+#   nothing) are what they should be. Those of images (an error of 0.02 in a band, a share of
 #   holes) were chosen, and another choice moves a method from one side to the other.
 # - **How a failure looks in motion.** *Jump* and *unevenness* are all that there is of time.
 # - **Derivatives elsewhere.** They are compared along a few directions, at one point of each

@@ -85,11 +85,11 @@ def _squares(gbuffer, camera, some):
 
     def each(both):
         light, shadow = both
-        picture = reflected(surface, light)
+        reflected_image = reflected(surface, light)
         if shadow is None:
-            return 2 * (tile_sums(picture**2),)
+            return 2 * (tile_sums(reflected_image**2),)
         shadow = shadow[..., None]
-        parts = picture, picture * shadow, picture * (1 - shadow)
+        parts = reflected_image, reflected_image * shadow, reflected_image * (1 - shadow)
         return tuple(tile_sums(part**2) for part in parts)
 
     return jax.lax.map(each, stacked(some, surface))

@@ -66,7 +66,7 @@ def rounding(method):
     "exact, of the picture whose border is repeated; biased, of what lies beyond it",
 )
 def borders(method):
-    """Against the blur of a picture that goes on: rms error in the four pixels about the frame,
+    """Against the blur of an image that goes on: rms error in the four pixels about the frame,
     where its border is repeated instead, and the largest one elsewhere."""
     whole = _checks()
     error = np.asarray(_program(method)(whole[8:-8, 8:-8]))
@@ -82,7 +82,7 @@ def borders(method):
 
 @case("blur", {"change": 0.0, "gradient": 0.0}, SAMPLINGS, "zero in sigma: the limit, exact")
 def sigma_to_0(method):
-    """For sigmas of 0, 1e-30, 1e-3 and 0.02: the largest change of the picture, which is to be
+    """For sigmas of 0, 1e-30, 1e-3 and 0.02: the largest change of the image, which is to be
     left alone, and the largest derivative."""
     image = jnp.asarray(_checks()[8:-8, 8:-8])
     wide = _program(method, is_wide=True)

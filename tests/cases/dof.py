@@ -62,7 +62,7 @@ REFERENCE = {"accumulate": "missing: of a rasteriser's picture, whose edges do n
 
 @case("dof", {"float32": 1e-5, "float64": 1e-12}, METHODS)
 def constant_image(method):
-    """A constant picture over any depth, of which some is infinite or next to the lens:
+    """A constant image over any depth, of which some is infinite or next to the lens:
     the largest error."""
     image, depth = random_picture()
     data = np.full_like(image, 0.7), depth
@@ -182,7 +182,7 @@ def highlight(method):
 )
 def bad_input(method):
     """Values that are not finite for depths of 0, 1e-30 and 1e30; how far, in pixels, a NaN of
-    the picture or of the depth spoils others with a radius of 5.9; the largest change without
+    the image or of the depth spoils others with a radius of 5.9; the largest change without
     an aperture. (Sizes from 1x1 on: tests/test_transforms.py; a focus distance that is not
     positive is a named error: tests/test_lens.py.)"""
     image, depth = random_picture()

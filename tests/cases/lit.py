@@ -111,7 +111,7 @@ def beside(light, rng):
 
 
 def problem(seed, kinds=(DirectionalLight, PointLight), noise=0.01, spheres=3):
-    """A picture with noise, a share of its root mean square; its lights; a start."""
+    """An image with noise, a share of its root mean square; its lights; a start."""
     rng = np.random.default_rng(seed)
     lights = [drawn(kind, rng) for kind in kinds]
     seen = [sphere_shadows(light, rng, spheres) for light in lights]

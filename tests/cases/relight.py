@@ -142,7 +142,7 @@ EDITS = {f"{count} lights, {10 * count} edits": count for count in (10, 100, 100
 def edit_one_light(method):
     """The operations and bytes of the compiled edit of one light of so many, over those of the
     only one, less 1 (times: benchmarks/test_relight_speed.py). The largest error, of the
-    picture's range, after so many edits of the same two lights in turn, in float32."""
+    image's range, after so many edits of the same two lights in turn, in float32."""
     count, (gbuffer, camera, lights) = EDITS[method], _small()
     start = relight.start(gbuffer, camera, [lights[2], lights[2], lights[1]])
     state = _edited(start, lights, jnp.asarray(10 * count // 6))
@@ -173,7 +173,7 @@ def _around() -> tuple[list[GBuffer], list[PinholeCamera]]:
 
 @ft.cache
 def _view(degrees: int) -> tuple[Any, ...]:
-    """The target, its own cache, and the picture of that."""
+    """The target, its own cache, and the image of that."""
     target = orbit(degrees, 0.1, LARGE)
     truth = cache(target, LARGE)
     return target, truth, relight.render(truth, target, scene.default_lights(target))
@@ -192,8 +192,8 @@ def _rms(one: Any, other: Any, mask: np.ndarray) -> float:
 )
 def new_view(method):
     """The still life's cache, put together from 1 to 8 others up to 14 degrees away, against
-    one rendered anew: the worst rms error of colour, diffuse, specular, roughness and normal
-    where any cache sees, and that of the relit picture; the share of holes; the picture's
+    one rendered again: the worst rms error of colour, diffuse, specular, roughness and normal
+    where any cache sees, and that of the relit image; the share of holes; the image's
     error in them once they are filled; and the share of wrong shaders."""
     count, degrees = VIEWS[method]
     gbuffers, cameras = (each[:count] for each in _around())
@@ -266,7 +266,7 @@ def close_surfaces(method):
 
 
 def pinhole_sees(truth: GBuffer, camera: PinholeCamera) -> np.ndarray:
-    """Which of the target's points lie in a camera's picture."""
+    """Which of the target's points lie in a camera's image."""
     pixels = np.asarray(camera.project(jnp.asarray(points(TARGET, truth.depth)))[0])
     return ((pixels >= 0) & (pixels < (32, 24))).all(axis=-1)
 
@@ -294,7 +294,7 @@ def averaged(gbuffer: GBuffer) -> GBuffer:
 
 @ft.cache
 def _antialiased() -> tuple[Any, ...]:
-    """The truth, the two wrong pictures and the pixels on silhouettes."""
+    """The truth, the two wrong images and the pixels on silhouettes."""
     height, width = 24, 32
     size, fine = ({"height": n * height, "width": n * width} for n in (1, FINE))
     mesh = scene.still_life()

@@ -1,4 +1,4 @@
-"""Caches of planes and of the still life, and single pixels, whose pictures are known."""
+"""Caches of planes and of the still life, and single pixels, whose images are known."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Where reprojection fails: what searches miss, and what a picture can't show of a new view."""
+"""Where reprojection fails: what searches miss, and what an image can't show of a new view."""
 
 import functools as ft
 import itertools
@@ -175,7 +175,7 @@ WARPS = {
 
 @case("reproject", {"image": 0.0, "alpha": 0.0}, WARPS)
 def same_camera(method):
-    """From its own camera a picture of random depths, a fifth infinite, is to be itself: the
+    """From its own camera an image of random depths, a fifth infinite, is to be itself: the
     largest difference, and the largest of alpha from 1."""
     search, dtype = WARPS[method]
     rng = np.random.default_rng(0)
@@ -201,7 +201,7 @@ def _source() -> tuple[Any, ...]:
 
 @ft.cache
 def _turned(degrees: int) -> tuple[Any, ...]:
-    """The target, its true picture and depth, and which pixels the source saw."""
+    """The target, its true image and depth, and which pixels the source saw."""
     source, photograph, _, depth, _ = _source()
     target = scenes.orbit(source, degrees, 2.8)
     truth, target_depth = photograph(target)
@@ -224,7 +224,7 @@ HOLES = "exact, of the point that a pixel shows; missing: what comes into sight,
     needs="embreex",
 )
 def turned_view(method):
-    """The still life turned about its middle, against rendering it anew: rms error of pixels
+    """The still life turned about its middle, against rendering it again: rms error of pixels
     that are drawn and were seen; the shares of pixels drawn though unseen, and empty though
     seen (in red, both); and of those that stay empty. The peers: Embree on a mesh of the depth,
     and a backward warp that is told the target's depth."""
@@ -258,7 +258,7 @@ def turned_view(method):
 def holes_in_depth(method):
     """Fields of nothing but 0, NaN, inf or -1, and rays that are not numbers: what is hit, and
     the steps of the longest search, which ends. A plane with a hole of 0 or NaN in depth and
-    picture, moved: pixels that are not finite, the largest change away from the hole."""
+    image, moved: pixels that are not finite, the largest change away from the hole."""
     return _holed_plane() if method == "warp" else _no_hits(method)
 
 
@@ -299,7 +299,7 @@ SLOPES = {f"slope {slope}": slope for slope in (2, 6)}
 @case("reproject", {"growth": 1.6, "steps": None}, SLOPES, "none: these are counts")
 def steps_with_size(method):
     """Mean steps of "pyramid" of a ray over a smooth field at 128x128, over those at 32x32, the
-    slant in texels growing with the picture; and those at 128x128. (Times, from 256x256 to
+    slant in texels growing with the image; and those at 128x128. (Times, from 256x256 to
     2048x2048: benchmarks/growth.py.)"""
     mean, shown = {}, None
     for size in (32, 128):

@@ -177,8 +177,8 @@ def _soft(kernel: str) -> tuple[Any, Any]:
     {"no softness": f"{HARD}, the picture's jumps are missing"},
 )
 def softness_to_0(method):
-    """The largest difference to the hard picture at a softness of 1e-6; and how far the
-    derivative of the whole picture, in map, receivers, bias and softness, lies from the
+    """The largest difference to the hard image at a softness of 1e-6; and how far the
+    derivative of the whole image, in map, receivers, bias and softness, lies from the
     difference quotient at 0.03, 0.3 and 1, relative to that (in the bias, over 0.1, where there
     is no softness)."""
     shadow_map, receivers = jax.tree.map(jnp.asarray, noise())

@@ -71,7 +71,7 @@ def test_the_report_agrees_with_the_pictures(still_life):
 def test_every_point_of_the_chart_is_in_the_report(still_life):
     chart = {point["name"]: point for point in read_report(still_life[0])["chart"]}
     assert {f"multi-pass {count}" for count in (4, 8)} < chart.keys()
-    assert "scatter of a given picture" in chart
+    assert "scatter of a given image" in chart
     assert all(point["seconds"] > 0 for point in chart.values())
     assert chart["multi-pass 8"]["psnr"] > chart["multi-pass 4"]["psnr"]
 

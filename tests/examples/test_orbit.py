@@ -47,7 +47,7 @@ def test_a_picture_with_depth(run, tmp_path):
     image = np.random.default_rng(0).random((12, 16, 3)).astype(np.float32)
     channels = {"": image, "depth": np.full((12, 16), 2.0, np.float32)}
     exr.write(tmp_path / "view.exr", channels)
-    run("--picture", tmp_path / "view.exr", "--frames", 5, "--out", tmp_path)
+    run("--image", tmp_path / "view.exr", "--frames", 5, "--out", tmp_path)
     sheet = np.asarray(Image.open(tmp_path / "orbit.png"))
     assert sheet.shape == (12, 80, 3)
     assert len(np.unique(sheet[:, 32:48].reshape(-1, 3), axis=0)) > 100

@@ -27,7 +27,7 @@ def example():
     module.CACHES = module.CACHES[:1]
     module.ROUNDS = module.ROUNDS[1], module.ROUNDS[-1], module.ROUNDS[-1]
     module.OFF = module.OFF / 2
-    module.draw = module.picture
+    module.draw = module.whole_image
     module.reverse = lambda *rest: 2 * module._pipeline.equations(*module.forward(*rest))[1]
     return module
 
