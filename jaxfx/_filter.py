@@ -16,6 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxfx._linear import linear
+from jaxfx._loops import cond, fori_loop
 from jaxfx._platform import by_platform
 
 
@@ -150,7 +151,7 @@ def _unpadded(
         strip = lax.dynamic_slice(sides, (1, i * (3 * reach)), (height, reach))
         return lax.dynamic_update_slice(whole, strip, (0, i * (row - reach)))
 
-    return lax.fori_loop(0, 2, put, whole).reshape(image.shape)
+    return fori_loop(0, 2, put, whole).reshape(image.shape)
 
 
 def _columns(
@@ -245,5 +246,5 @@ def apart(image: Array, compute: Callable[[], Array]) -> Array:
     """
     shape = jax.eval_shape(compute)
     nothing = lambda: jnp.zeros(shape.shape, shape.dtype)
-    branch = lambda: lax.cond(image.reshape(-1)[0] < -jnp.inf, nothing, compute)
+    branch = lambda: cond(image.reshape(-1)[0] < -jnp.inf, nothing, compute)
     return by_platform(cpu=branch, accelerator=lambda: lax.optimization_barrier(compute()))

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
+from jaxfx._loops import cond, fori_loop
+
 
 _WORD_BITS = 32
 # Pixels per iteration. Larger chunks waste more work on the last one and need more memory;
@@ -46,10 +48,12 @@ def fold(
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(load, steps))
 
     def body(k, carry):
-        pixels, fetched = jax.lax.cond(k < steps, load, lambda _: nothing, k)
+        pixels, fetched = cond(
+            k < steps, lambda k, _: load(k), lambda _, nothing: nothing, k, nothing
+        )
         return step(carry, pixels, fetched)
 
-    return jax.lax.fori_loop(0, steps, body, start)
+    return fori_loop(0, steps, body, start)
 
 
 def _pack(bits: Bool[Array, " pixel"]) -> UInt32[Array, " word"]:
