@@ -16,6 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxfx._linear import linear
+from jaxfx._loops import fori_loop
 from jaxfx._xla import added, added_in_groups
 
 
@@ -146,7 +147,7 @@ def _unpadded(
         strip = lax.dynamic_slice(sides, (1, i * (3 * reach)), (height, reach))
         return lax.dynamic_update_slice(whole, strip, (0, i * (row - reach)))
 
-    return lax.fori_loop(0, 2, put, whole).reshape(image.shape)
+    return fori_loop(0, 2, put, whole).reshape(image.shape)
 
 
 def _columns(

@@ -10,6 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfx._loops import scan, while_loop
+from jaxfx._platform import at_once
+
 
 # Costs of a path, in units of the image's longer side, so that they do not depend on the
 # resolution. Both were found by trial. `EDGE`: of a step over the guide's whole range. With
@@ -93,13 +96,7 @@ def cheapest_sources(
     source = jnp.arange(height * width).reshape(height, width)
     paths = jnp.where(is_known, 0, jnp.inf).astype(depth.dtype), source
 
-    def sweep(state):
-        before = paths = state[0]
-        for step in steps:
-            paths = jax.tree.map(jnp.rot90, _swept_down(paths, step))
-        return paths, jnp.any(paths[0] < before[0])
-
-    (_, source), _ = jax.lax.while_loop(lambda s: s[1], sweep, (paths, jnp.array(True)))
+    _, source = at_once(_swept_until_still)(*jax.lax.stop_gradient((paths, steps)))
     for _ in range(medians):
         source = jnp.where(is_known, source, _median_sources(depth, source))
     return source
@@ -130,6 +127,18 @@ def _steps_down(
     return jnp.stack(steps, axis=1)
 
 
+def _swept_until_still(paths: Paths, steps: list[Float[Array, "_ 3 _"]]) -> Paths:
+    """The paths after sweeps from all four sides, until one changes none."""
+
+    def sweep(state):
+        before = paths = state[0]
+        for step in steps:
+            paths = jax.tree.map(jnp.rot90, _swept_down(paths, step))
+        return paths, jnp.any(paths[0] < before[0])
+
+    return while_loop(lambda s: s[1], sweep, (paths, jnp.array(True)))[0]
+
+
 def _swept_down(paths: Paths, steps: Float[Array, "height 3 width"]) -> Paths:
     """The paths after each row in turn has taken the cheaper ones from the row above."""
 
@@ -145,7 +154,7 @@ def _swept_down(paths: Paths, steps: Float[Array, "height 3 width"]) -> Paths:
         return (cost, source), (cost, source)
 
     no_paths = jnp.full_like(paths[0][0], jnp.inf), paths[1][0]
-    return jax.lax.scan(row, no_paths, (paths, steps))[1]
+    return scan(row, no_paths, (paths, steps))[1]
 
 
 def _median_sources(depth: Plane, source: Source) -> Source:

@@ -6,8 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap, sequential_vmap
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
+
+from jaxfx._loops import alike, cond
+from jaxfx._meshes import each_device
 
 
 def by_platform(
@@ -18,6 +21,7 @@ def by_platform(
     The choice is made when a program is lowered: one `jit`ted function is right wherever it
     runs. Both functions are traced, so that neither may be long to trace.
     """
+    (cpu, accelerator), operands = alike((cpu, accelerator), *operands)
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
@@ -28,20 +32,51 @@ def one_by_one_on_cpu(
 
     On a CPU each member of a batch then costs what it costs alone: a `cond` stays a `cond`, and
     a loop ends with its own data. On an accelerator one launch serves the whole batch.
-    `accelerator` is the function there, if it is another one.
+    `accelerator` is the function there, if it is another one. Of a batch that is spread over
+    devices, each device computes its own members.
     """
-    elsewhere = function if accelerator is None else accelerator
+    return of_batches(function, function if accelerator is None else accelerator, ())
 
-    @custom_vmap
-    def one(*operands):
-        if elsewhere is function:
-            return function(*operands)
-        return by_platform(*operands, cpu=function, accelerator=elsewhere)
+
+def at_once(
+    function: Callable[..., Any], accelerator: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """`function` of arrays, which takes a batch at once, and on each device its own members.
+
+    A loop that ends with its data would else ask all devices whether it goes on.
+    """
+    return of_batches(function, function if accelerator is None else accelerator, (), _at_once)
+
+
+def of_batches(
+    cpu: Callable[..., Any],
+    accelerator: Callable[..., Any],
+    levels: tuple[list[bool], ...],
+    rule_on_cpu: Callable[[Callable[..., Any], Any], Callable[..., Any]] | None = None,
+) -> Callable[..., Any]:
+    """A function of arrays that have `levels` axes of batches already, outermost first.
+
+    - `cpu`, `accelerator`: the function as lowered for either.
+    - `levels`: of each of these axes, which of the operands' leaves have it.
+    - `rule_on_cpu`: makes of a function the function of one more batch, given which leaves have
+      that axis; one by one if it is left out.
+    """
+
+    def chosen(*operands):
+        if accelerator is cpu:
+            return cpu(*operands)
+        return by_platform(*operands, cpu=cpu, accelerator=accelerator)
+
+    one = custom_vmap(each_device(chosen, levels) if levels else chosen)
+    rule = rule_on_cpu or _in_turn
 
     @one.def_vmap
     def batch(_size, is_batched, *operands):
-        in_turn, at_once = _in_turn(function, is_batched), _at_once(elsewhere, is_batched)
-        out = by_platform(*operands, cpu=in_turn, accelerator=at_once)
+        on_cpu, elsewhere = rule(cpu, is_batched), _at_once(accelerator, is_batched)
+        if rule is _at_once and cpu is accelerator:
+            elsewhere = on_cpu
+        more = (jax.tree.leaves(is_batched), *levels)
+        out = of_batches(on_cpu, elsewhere, more, rule_on_cpu)(*operands)
         return out, jax.tree.map(lambda _: True, out)
 
     return one
@@ -58,7 +93,11 @@ def either(
     A batch goes one by one on a CPU. On an accelerator, where to look at a predicate takes as
     long as a few launches, it is looked at once: where it holds for all, all take `short`.
     """
-    choose = lambda *operands: jax.lax.cond(predicate(*operands), short, long, *operands)
+    return _either(predicate, short, long)(*operands)
+
+
+def _either(predicate, short, long) -> Callable[..., Any]:
+    choose = lambda *operands: cond(predicate(*operands), short, long, *operands)
     one = custom_vmap(choose)
 
     @one.def_vmap
@@ -73,17 +112,16 @@ def either(
             )
             return select(asks(*operands), shorts(*operands), longs(*operands))
 
-        at_once = lambda *operands: either(ask_all, shorts, each, *operands)
-        out = by_platform(*operands, cpu=_in_turn(choose, is_batched), accelerator=at_once)
+        in_turn, together = _in_turn(choose, is_batched), _either(ask_all, shorts, each)
+        out = of_batches(in_turn, together, (jax.tree.leaves(is_batched),))(*operands)
         return out, jax.tree.map(lambda _: True, out)
 
-    return one(*operands)
+    return one
 
 
 def _in_turn(function: Callable[..., Any], is_batched: Any) -> Callable[..., Any]:
     """`function` of batches, one member after the other."""
     mapped = jax.tree.leaves(is_batched)
-    single = sequential_vmap(function)  # in a batch of batches
 
     def loop(*operands):
         leaves, tree = jax.tree.flatten(operands)
@@ -91,7 +129,7 @@ def _in_turn(function: Callable[..., Any], is_batched: Any) -> Callable[..., Any
         def member(moving):
             moving = iter(moving)
             every = [next(moving) if m else x for x, m in zip(leaves, mapped, strict=True)]
-            return single(*jax.tree.unflatten(tree, every))
+            return function(*jax.tree.unflatten(tree, every))
 
         return jax.lax.map(member, [x for x, m in zip(leaves, mapped, strict=True) if m])
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxfx._loops import cond
 from jaxfx._platform import by_platform
 
 
@@ -41,7 +42,7 @@ def stored(is_needed: Bool[Array, ""], compute: Callable[..., Any], *operands: A
     """
     shapes = jax.eval_shape(compute, *operands)
     nothing = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return lax.cond(is_needed, compute, nothing, *operands)
+    return cond(is_needed, compute, nothing, *operands)
 
 
 def added(terms: list[Callable[[], Array]]) -> Array:

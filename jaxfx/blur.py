@@ -41,6 +41,8 @@ from jaxfx._filter import (
     linear_reads,
     separable,
 )
+from jaxfx._loops import fori_loop
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
 from jaxfx._xla import added, apart
 
@@ -67,6 +69,7 @@ class LinearTaps(NamedTuple):
     weights: Float[Array, "reads"]
 
 
+@on_any_mesh
 def gaussian(
     image: Float[ArrayLike, "height width channel"],
     *,
@@ -196,6 +199,7 @@ def binomial_weights(taps: WholeNumber, *, row: WholeNumber) -> Float[Array, "ta
     return jnp.asarray(_binomial("binomial_weights", taps, row))
 
 
+@on_any_mesh
 def linear_taps(
     tap_weights: Float[ArrayLike, "taps"],
 ) -> LinearTaps:
@@ -243,6 +247,7 @@ def linear_taps(
     return LinearTaps(offsets, jnp.stack([weight for _, _, weight in reads]))
 
 
+@on_any_mesh
 def downsample(
     image: Float[ArrayLike, "height width channel"], *, taps: WholeNumber = 2
 ) -> Float[Array, "half_height half_width channel"]:
@@ -322,7 +327,7 @@ def _gaussian_blur(image, sigma, taps, passes, sampling):
 def _repeated(one_pass, image, passes):
     """The image after all passes, computed in `working_dtype`."""
     working = image.astype(working_dtype(image.dtype))
-    working = lax.fori_loop(0, passes, lambda _, image: one_pass(image), working)
+    working = fori_loop(0, passes, lambda _, image: one_pass(image), working)
     return working.astype(image.dtype)
 
 

@@ -26,6 +26,7 @@ from jaxfx._arguments import check_camera
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_numpy, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import inverse, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -38,6 +39,7 @@ __all__ = ["Filled", "clean", "fill", "from_disparity", "from_ray_distance", "fr
 SKY = (1e10, 65504.0)
 
 
+@on_any_mesh
 def clean(
     depth: Num[ArrayLike, "height width"],
     *,
@@ -79,6 +81,7 @@ def clean(
     return _with_holes(safe_depth, is_known, is_background)
 
 
+@on_any_mesh
 def from_disparity(
     disparity: Num[ArrayLike, "height width"],
     *,
@@ -123,6 +126,7 @@ def from_disparity(
     return _with_holes(safe_depth, is_known, is_number & (inverse_depth == 0))
 
 
+@on_any_mesh
 def from_stereo(
     disparity: Num[ArrayLike, "height width"],
     *,
@@ -177,6 +181,7 @@ def from_stereo(
     return _with_holes(safe_depth, is_known, jnp.zeros_like(is_known))
 
 
+@on_any_mesh
 def from_ray_distance(
     distance: Num[ArrayLike, "height width"], camera: PinholeCamera | OrthographicCamera
 ) -> Float[Array, "height width"]:
@@ -239,6 +244,7 @@ class Filled(eqx.Module):
     filled: Bool[Array, "height width"]
 
 
+@on_any_mesh
 def fill(
     depth: Num[ArrayLike, "height width"],
     image: Float[ArrayLike, "height width channel"] | None = None,

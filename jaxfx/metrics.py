@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array, check, check_image, is_concrete, option, parameter
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
 
 
@@ -44,6 +45,7 @@ def _pair(
     return image.astype(dtype), reference.astype(dtype), data_range.astype(dtype)
 
 
+@on_any_mesh
 def psnr(
     image: Float[ArrayLike, "height width channel"],
     reference: Float[ArrayLike, "height width channel"],
@@ -111,6 +113,7 @@ _WINDOWS = {
 }
 
 
+@on_any_mesh
 def ssim(
     image: Float[ArrayLike, "height width channel"],
     reference: Float[ArrayLike, "height width channel"],

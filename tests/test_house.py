@@ -25,7 +25,7 @@ NUMERICS = {
     *("_arrays", "_checks", "_choice", "_extras", "_filter", "_holes", "_linear", "_numerics"),
     "_platform",
     "_xla",
-    *("_progress", "_pyramid", "_sampling", "_tiles"),
+    *("_loops", "_meshes", "_progress", "_pyramid", "_sampling", "_tiles"),
 }
 TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "transfer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfx._checks import as_array
+from jaxfx._loops import scan
 from jaxfx.budget._light_energy import Energy, by_kind, stacked
 from jaxfx.budget._search import Search, Trial
 from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of
@@ -105,7 +106,7 @@ def _tiled(gbuffer, camera, everywhere, parts):
 
     for members in by_kind(*zip(*everywhere, strict=True)) if everywhere else []:
         some = [everywhere[n] for n in members]
-        image, _ = jax.lax.scan(add, image, stacked(some, surface))
+        image, _ = scan(add, image, stacked(some, surface))
 
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), surface)
     pixels = image.reshape(-1, 3)
@@ -123,5 +124,5 @@ def _tiled(gbuffer, camera, everywhere, parts):
                 shown = shown * shadow[:, None]
             return pixels.at[where].add(shown, mode="drop"), None
 
-        pixels, _ = jax.lax.scan(block, pixels, tuple(of_each))
+        pixels, _ = scan(block, pixels, tuple(of_each))
     return pixels.reshape(image.shape).astype(gbuffer.color.dtype)

@@ -12,6 +12,7 @@ from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number
 from jaxfx._filter import folded
 from jaxfx._linear import linear
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof._discs import vogel
 from jaxfx.dof.arguments import check_arguments, defocused
@@ -23,6 +24,7 @@ from jaxfx.lens import Lens
 _TAPS = 12
 
 
+@on_any_mesh
 def blend(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],

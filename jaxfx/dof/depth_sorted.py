@@ -9,6 +9,8 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, whole_number
+from jaxfx._loops import scan
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import absolute, clip01
 from jaxfx.dof.arguments import check_arguments, defocused, with_own
 from jaxfx.dof.kernels._tiles import sum_all
@@ -21,6 +23,7 @@ from jaxfx.lens import Lens
 _LEAST = 1e-12
 
 
+@on_any_mesh
 def depth_sorted(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
@@ -132,7 +135,7 @@ def _in_slices(
 
     start = jnp.zeros_like(value), jnp.zeros_like(value[..., :1])
     indices = jnp.arange(slices, dtype=value.dtype)
-    (sums, _), _ = jax.lax.scan(jax.checkpoint(add_slice), start, indices)
+    (sums, _), _ = scan(jax.checkpoint(add_slice), start, indices)
     return sums
 
 
@@ -174,4 +177,4 @@ def _in_order(
         return sums + visible[..., None] * added, None
 
     start = jnp.zeros_like(taps[0])
-    return jax.lax.scan(jax.checkpoint(add_tap), start, (taps, depths))[0]
+    return scan(jax.checkpoint(add_tap), start, (taps, depths))[0]

@@ -16,6 +16,8 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
+from jaxfx._loops import scan
+from jaxfx._meshes import on_any_mesh
 from jaxfx._platform import by_platform
 from jaxfx.dof.arguments import Defocused, check_arguments, defocused
 from jaxfx.lens import Lens
@@ -26,6 +28,7 @@ from jaxfx.lens import Lens
 _LARGEST_CONDUCTANCE = 1 / 4
 
 
+@on_any_mesh
 def anisotropic_diffusion(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
@@ -85,6 +88,7 @@ def anisotropic_diffusion(
     return _explicit(image, depth, lens, edge, max_coc)
 
 
+@on_any_mesh
 def implicit_diffusion(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
@@ -191,10 +195,10 @@ def _explicit(image, depth, lens, edge, max_coc):
 
     @jax.checkpoint
     def inner_steps(channels, _):
-        return jax.lax.scan(step, channels, None, inner)
+        return scan(step, channels, None, inner)
 
     channels = tuple(jnp.moveaxis(view.image, -1, 0))
-    channels, _ = jax.lax.scan(inner_steps, channels, None, outer)
+    channels, _ = scan(inner_steps, channels, None, outer)
     result = jnp.stack(channels, axis=-1)
     return jnp.where((view.bad | view.lost)[..., None], jnp.nan, result).astype(image.dtype)
 
@@ -250,14 +254,14 @@ def _thomas(
 
     one = jnp.ones_like(after[0])
     start = one, jnp.zeros_like(heat[0]), one
-    _, (known, ratio) = jax.lax.scan(eliminate, start, (before, after, heat))
+    _, (known, ratio) = scan(eliminate, start, (before, after, heat))
 
     def substitute(x, row):
         known, ratio = row
         x = known + ratio * x
         return x, x
 
-    _, x = jax.lax.scan(substitute, jnp.zeros_like(heat[0]), (known, ratio), reverse=True)
+    _, x = scan(substitute, jnp.zeros_like(heat[0]), (known, ratio), reverse=True)
     return x
 
 

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check, parameter, whole_number
+from jaxfx._loops import scan
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import absolute, clip01
 from jaxfx._platform import by_platform
 from jaxfx._sampling import bilinear, pixel_centers
@@ -22,6 +24,7 @@ _SIDE = 4
 _LOW_RADIUS = 0.4
 
 
+@on_any_mesh
 def gather(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
@@ -148,9 +151,7 @@ def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
 
     zero = jnp.zeros_like(image)
     offsets = jnp.asarray(disc, image.dtype)
-    sums, _ = jax.lax.scan(
-        jax.checkpoint(add_tap), (zero, zero[..., :1]), offsets, unroll=at_once
-    )
+    sums, _ = scan(jax.checkpoint(add_tap), (zero, zero[..., :1]), offsets, unroll=at_once)
     sums = with_own(jnp.concatenate(sums, axis=-1), view.image, view.missing)
     result = sums[..., :-1] / sums[..., -1:]
     return jnp.where(view.lost[..., None], jnp.nan, result).astype(dtype)

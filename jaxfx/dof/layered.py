@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, check_depth, check_image, is_concrete, items, parameter
+from jaxfx._loops import scan
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.arguments import check_arguments, compiled, defocused, with_own
@@ -32,6 +34,7 @@ _LEVEL = 1e-2
 _SEEN = 0.25
 
 
+@on_any_mesh
 def layered(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
@@ -258,7 +261,7 @@ def _seen(
 
         # The pixel itself hides the point, by half its width to each side.
         start = jnp.ones_like(defocus), length / 2 / ahead(farther - defocus)
-        hidden = jax.lax.scan(jax.checkpoint(step), start, jnp.arange(1, steps))[0][1]
+        hidden = scan(jax.checkpoint(step), start, jnp.arange(1, steps))[0][1]
         return 1 - clip01(hidden) ** 2
 
     return jnp.mean(jax.lax.map(visible, jnp.asarray(directions)), axis=0)

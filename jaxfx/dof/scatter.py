@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, option, parameter
+from jaxfx._meshes import on_any_mesh
 from jaxfx._platform import either
 from jaxfx.dof.arguments import check_arguments, largest_of, pixels, with_own
 from jaxfx.dof.kernels._adjoint import with_adjoint
@@ -43,6 +44,7 @@ _LOG_VISIBILITY = 60.0
 _SMALLEST_EPSILON = 1e-6
 
 
+@on_any_mesh
 def scatter(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],

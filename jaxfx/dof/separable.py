@@ -9,6 +9,8 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
+from jaxfx._loops import scan
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import absolute
 from jaxfx._platform import by_platform
 from jaxfx.dof.arguments import OWN, check_arguments, defocused
@@ -27,6 +29,7 @@ _BAND = 16
 _TOGETHER = 6
 
 
+@on_any_mesh
 def separable(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],
@@ -176,5 +179,5 @@ def _along_rows(
     own = jnp.where(known == 0, OWN, jnp.zeros_like(coc))
     start = jnp.where(known[None] == 0, OWN * image, 0), own
     offsets = jnp.arange(count) - far
-    (sums, weights), _ = jax.lax.scan(add_taps, start, offsets.reshape(-1, together))
+    (sums, weights), _ = scan(add_taps, start, offsets.reshape(-1, together))
     return sums / weights[None]

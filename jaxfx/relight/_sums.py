@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfx._loops import scan
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight.shading import Surface, received, shadowed, stack_visibilities
 
@@ -57,7 +58,7 @@ def with_lights(surface, sums, lights, visibilities, signs):
         group = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lights[i] for i in which))
         shadows = stack_visibilities([visibilities[i] for i in which], surface)
         step = lambda sums, term: (_with_term(surface, sums, *term), None)
-        sums, _ = jax.lax.scan(step, sums, (group, shadows, signs[jnp.array(which)]))
+        sums, _ = scan(step, sums, (group, shadows, signs[jnp.array(which)]))
     return sums
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Num
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._choice import Choice
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -22,6 +23,7 @@ from jaxfx.relight._new_view import check_caches, check_new_depth, look_up, poin
 _FOR_SEEING = 3
 
 
+@on_any_mesh
 def choose(
     gbuffers: Sequence[GBuffer],
     cameras: Sequence[PinholeCamera | OrthographicCamera],

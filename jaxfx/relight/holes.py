@@ -9,7 +9,9 @@ from jaxtyping import Array, Bool, Int
 from jaxfx._arguments import check_gbuffer
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array
-from jaxfx._platform import by_platform
+from jaxfx._loops import cond, while_loop
+from jaxfx._meshes import on_any_mesh
+from jaxfx._platform import at_once
 from jaxfx.gbuffer import GBuffer
 
 
@@ -35,6 +37,7 @@ class FilledCache(NamedTuple):
     hole_count: Int[Array, ""]
 
 
+@on_any_mesh
 def fill_holes(gbuffer: GBuffer, views: Int[ArrayLike, "height width"]) -> FilledCache:
     """Fill what `synthesize` left open, each hole from the nearest pixel that a cache shows.
 
@@ -110,7 +113,7 @@ def _nearest_covered(is_covered: _Mask, is_hole: _Mask) -> tuple[_Mask, _Integer
     nearest_row = jnp.where(row - above <= below - row, above, below)
     distance = jnp.minimum(jnp.abs(nearest_row - row), _FAR)
     planes = distance**2, jnp.clip(nearest_row, 0, height - 1), is_hole
-    squared, index = by_platform(*planes, cpu=_widening, accelerator=_in_two_passes)
+    squared, index = at_once(_widening, _in_two_passes)(*planes)
     return squared < _FAR**2, index
 
 
@@ -148,7 +151,7 @@ def _widening(
         jnp.full(is_hole.shape, _FAR**2, jnp.int32),
         jnp.zeros(is_hole.shape, jnp.int32),
     )
-    return jax.lax.while_loop(is_open, widen, first)[1:]
+    return while_loop(is_open, widen, first)[1:]
 
 
 def _in_two_passes(
@@ -160,7 +163,7 @@ def _in_two_passes(
     if width - 1 > _NEAR_COLUMNS:
         is_open = jnp.any(is_hole & (least > _NEAR_COLUMNS**2))
         everywhere = lambda: _least_over_columns(squares, width - 1)
-        least, column = jax.lax.cond(is_open, everywhere, lambda: near)
+        least, column = cond(is_open, everywhere, lambda: near)
     return least, jnp.take_along_axis(rows, column, axis=1) * width + column
 
 

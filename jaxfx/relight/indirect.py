@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_gbuffer, check_lights
 from jaxfx._checks import shares
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
@@ -16,6 +17,7 @@ from jaxfx.relight.shading import Surface, check_shader, received
 from jaxfx.transfer import Transfer
 
 
+@on_any_mesh
 def indirect(
     gbuffer: GBuffer,
     transfer: Transfer,

@@ -19,6 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, share, shares
+from jaxfx._loops import scan
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
@@ -43,6 +45,7 @@ _TOGETHER = 8
 _LEAST_ROUGHNESS = 1e-4
 
 
+@on_any_mesh
 def shade(
     gbuffer: GBuffer,
     camera: PinholeCamera | OrthographicCamera,
@@ -109,6 +112,7 @@ def shade(
     return _shade(gbuffer, camera, light, visibility)
 
 
+@on_any_mesh
 def render(
     gbuffer: GBuffer,
     camera: PinholeCamera | OrthographicCamera,
@@ -359,7 +363,7 @@ def _one_by_one(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
         light, visibility = term
         return image + shadowed(surface, _again(surface, light), visibility), None
 
-    return jax.lax.scan(add, image, terms)[0]
+    return scan(add, image, terms)[0]
 
 
 def _together(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
@@ -374,7 +378,7 @@ def _together(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
     in_groups = count - count % _TOGETHER
     if in_groups:
         groups = lambda x: x[:in_groups].reshape(-1, _TOGETHER, *x.shape[1:])
-        image, _ = jax.lax.scan(add, image, jax.tree.map(groups, terms))
+        image, _ = scan(add, image, jax.tree.map(groups, terms))
     if in_groups < count:
         image, _ = add(image, jax.tree.map(lambda x: x[in_groups:], terms))
     return image

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxfx._arguments import check_light, check_lights
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array, parameter, share, shares, whole_number
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
@@ -29,6 +30,7 @@ _Image = Float[Array, "height width 3"]
 _Visibility = Float[Array, "height width"]
 
 
+@on_any_mesh
 def start(
     gbuffer: GBuffer,
     camera: PinholeCamera | OrthographicCamera,

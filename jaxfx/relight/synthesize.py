@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Int, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, number, option
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -43,6 +44,7 @@ class Synthesis(NamedTuple):
     views: Int[Array, "height width"]
 
 
+@on_any_mesh
 def synthesize(
     gbuffers: Sequence[GBuffer],
     cameras: Sequence[PinholeCamera | OrthographicCamera],

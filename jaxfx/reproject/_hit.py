@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfx._loops import fori_loop, scan
 from jaxfx._numerics import safe_divide
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, not_before_start
 
@@ -69,7 +70,7 @@ class Patch(NamedTuple):
         weights = self.weights.astype(image.dtype)
         total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
         sums = total, jnp.zeros_like(weights[0])
-        (total, weight_sum), _ = jax.lax.scan(add, sums, (self.rows, self.columns, weights))
+        (total, weight_sum), _ = scan(add, sums, (self.rows, self.columns, weights))
         return safe_divide(total, jnp.broadcast_to(weight_sum[:, None], total.shape))
 
 
@@ -211,7 +212,7 @@ def patch_point(
     # One more iteration only computes the slope at the end. A loop's result is stored; outside
     # of the loop, XLA would compute the slope again wherever it is used.
     start = hit.time, jnp.full_like(hit.time, jnp.inf), jnp.ones_like(hit.time)
-    time, last_move, slope = jax.lax.fori_loop(0, _NEWTON_STEPS + 1, newton, start)
+    time, last_move, slope = fori_loop(0, _NEWTON_STEPS + 1, newton, start)
     terms = jnp.abs(d[:, 2]) + jnp.abs(slope - d[:, 2])
     is_steep = slope > _MIN_SLOPE * terms
     is_on_patch = is_steep & (last_move * speed < _CONVERGED_TEXELS) & hit.mask

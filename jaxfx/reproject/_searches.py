@@ -13,9 +13,12 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-from jaxfx._platform import by_platform
+from jaxfx._loops import fori_loop
+from jaxfx._meshes import each_device
+from jaxfx._platform import of_batches
 from jaxfx._pyramid import Pyramid, minimum_pyramid
 from jaxfx.reproject._crossings import (
     START,
@@ -64,31 +67,49 @@ def first_crossing(
 
 @functools.cache
 def _batchable(search: str, max_steps: int | None, origin_at_end: bool):
-    """A search with a rule for `vmap`: rays of a batch on one height field are concatenated."""
     function = _SEARCHES[search]
 
     def single(height_field, origin, direction):
         return function(height_field, origin, direction, max_steps, origin_at_end)
 
-    batchable = jax.custom_batching.custom_vmap(single)
+    return _of_batches(single, ())
+
+
+def _of_batches(search, levels: tuple[list[bool], ...]):
+    """A search with a rule for `vmap`: rays of a batch on one height field are concatenated.
+
+    `levels` are those of `of_batches`. On a CPU, batches of height fields go one by one: a loop
+    under `vmap` would run every search as long as the longest.
+    """
+    batchable = custom_vmap(each_device(search, levels) if levels else search)
 
     @batchable.def_vmap
-    def batch(size, batched, height_field, origin, direction):
-        all_batched = jax.tree.unflatten(_HIT_STRUCTURE, [True] * len(TexelHit._fields))
-        expand = lambda x, is_batched: (
-            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
-        )
-        origin, direction = expand(origin, batched[1]), expand(direction, batched[2])
-        if batched[0]:
-            # On a CPU a loop under `vmap` would run every search as long as the longest.
-            in_turn = lambda *args: jax.lax.map(lambda item: batchable(*item), args)
-            at_once = jax.vmap(single)
-            args = height_field, origin, direction
-            return by_platform(*args, cpu=in_turn, accelerator=at_once), all_batched
-        hit = batchable(height_field, origin.reshape(-1, 3), direction.reshape(-1, 3))
-        return jax.tree.map(lambda x: x.reshape(size, -1), hit), all_batched
+    def batch(size, is_batched, height_field, *rays):
+        rays = [
+            ray if has_axis else jnp.broadcast_to(ray, (size, *ray.shape))
+            for ray, has_axis in zip(rays, is_batched[1:], strict=True)
+        ]
+        is_batched = [is_batched[0], True, True]
+        more = is_batched, *levels
+        if is_batched[0]:
+            in_turn = lambda *data: jax.lax.map(lambda items: search(*items), data)
+            found = of_batches(in_turn, jax.vmap(search), more)(height_field, *rays)
+        else:
+            found = _of_batches(_concatenated(search), more)(height_field, *rays)
+        return found, jax.tree.map(lambda _: True, found)
 
     return batchable
+
+
+def _concatenated(search):
+    """A search for a batch of rays, of all members together."""
+
+    def together(height_field, *rays):
+        merged = [ray.reshape(-1, *ray.shape[2:]) for ray in rays]
+        found = search(height_field, *merged)
+        return jax.tree.map(lambda x: x.reshape(*rays[0].shape[:2], *x.shape[1:]), found)
+
+    return together
 
 
 def descend(
@@ -159,14 +180,13 @@ def relief(
         is_behind = _gap(height_field, r, middle) >= 0
         return jnp.where(is_behind, before, middle), jnp.where(is_behind, middle, after)
 
-    _, time = jax.lax.fori_loop(0, _BISECTIONS, bisect, (before, after))
+    _, time = fori_loop(0, _BISECTIONS, bisect, (before, after))
     steps = steps + jnp.where(mask, _BISECTIONS, 0)
     return _texel_hit(height_field, r, time, *_xy_at(r, time), mask, steps)
 
 
 # The searches by the names that `intersect`, `warp` and `blend` accept.
 _SEARCHES = {"pyramid": traverse, "descent": descend, "linear": linear, "relief": relief}
-_HIT_STRUCTURE = jax.tree.structure(TexelHit(*TexelHit._fields))  # pyright: ignore[reportArgumentType]
 
 
 def _rays_and_entry(
@@ -192,7 +212,7 @@ def _first_step_behind(
         return jnp.where((gap >= 0) & (first > count), index.astype(jnp.int32), first)
 
     first = jnp.where(entry.inside, count + 1, 0).astype(jnp.int32)
-    first = jax.lax.fori_loop(0, count + 1, compare, first)
+    first = fori_loop(0, count + 1, compare, first)
     mask = entry.inside & (first <= count)
     after = start + first.astype(start.dtype) * length
     before = jnp.where(first == 0, after, after - length)

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
+from jaxfx._loops import while_loop
 from jaxfx._platform import by_platform
 from jaxfx._pyramid import Pyramid, minimum_pyramid
 from jaxfx.reproject._crossings import (
@@ -260,7 +261,7 @@ def _step_packed(pyramid, r, state, steps, max_steps):
         state = jnp.where(unfinished, step(pyramid, r, state), state)
         return state, steps + unfinished.astype(jnp.int32)
 
-    state, steps = jax.lax.while_loop(goes_on, body, (state, steps))
+    state, steps = while_loop(goes_on, body, (state, steps))
     if packed_count:
         unfinished = _is_unfinished(state, steps, max_steps)
         slot = jnp.where(unfinished, jnp.cumsum(unfinished, dtype=jnp.int32) - 1, packed_count)
@@ -291,7 +292,7 @@ def _step_all(pyramid, r, state, steps, max_steps):
             steps = steps + unfinished.astype(jnp.int32)
         return state, steps
 
-    return jax.lax.while_loop(goes_on, body, (state, steps))
+    return while_loop(goes_on, body, (state, steps))
 
 
 def _is_unfinished(state: Array, steps: Array, max_steps: int) -> Bool[Array, " ray"]:

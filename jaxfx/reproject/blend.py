@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Num
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check_map, whole_number
 from jaxfx._choice import Choice
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
@@ -33,6 +34,7 @@ from jaxfx.reproject.view import trace_with_angle
 _STRIDE = 8
 
 
+@on_any_mesh
 def blend(
     images: Sequence[Float[ArrayLike, "height width channel"]],
     depths: Sequence[Num[ArrayLike, "height width"]],
@@ -122,6 +124,7 @@ def _blended(
     return safe_divide(total, weight_sum).reshape(*size, -1), alpha.reshape(size)
 
 
+@on_any_mesh
 def choose(
     depths: Sequence[Num[ArrayLike, "height width"]],
     cameras: Sequence[PinholeCamera],

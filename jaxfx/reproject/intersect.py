@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, option, parameter, whole_number
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
 from jaxfx.reproject._hit import patch_point, texel_point
 from jaxfx.reproject._searches import first_crossing
@@ -35,6 +36,7 @@ class Hit(NamedTuple):
     grazing: Bool[Array, "*ray"]
 
 
+@on_any_mesh
 def intersect(
     depth: Num[ArrayLike, "height width"],
     origin: Float[ArrayLike, "*ray 3"],

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float, Num
 from jaxfx._arguments import check_camera
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check_image
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import Camera, PinholeCamera
@@ -19,6 +20,7 @@ from jaxfx.reproject.arguments import (
 from jaxfx.reproject.view import trace_pixels
 
 
+@on_any_mesh
 def warp(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
+from jaxfx._loops import fori_loop
 from jaxfx._xla import stored
 
 
@@ -48,7 +49,7 @@ def fold(
         pixels, fetched = stored(k < steps, load, k)
         return step(carry, pixels, fetched)
 
-    return jax.lax.fori_loop(0, steps, body, start)
+    return fori_loop(0, steps, body, start)
 
 
 def _pack(bits: Bool[Array, " pixel"]) -> UInt32[Array, " word"]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxfx._arguments import check_light
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, parameter, whole_number
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import normalize
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.light import AmbientLight, DirectionalLight, Light, SpotLight
@@ -25,6 +26,7 @@ _FACES = (
 )
 
 
+@on_any_mesh
 def light_cameras(
     light: Light,
     *,

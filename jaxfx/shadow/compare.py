@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfx._loops import scan
 from jaxfx._numerics import absolute, working_dtype
 from jaxfx._xla import apart
 from jaxfx.shadow.receivers import Receivers
@@ -236,7 +237,7 @@ def sum_rows(row: Any, size: int) -> Any:
     zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(row, jnp.asarray(0, jnp.int32)))
     zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), zero)
     step = jax.checkpoint(lambda total, dy: (jax.tree.map(jnp.add, total, row(dy)), None))
-    return jax.lax.scan(step, zero, jnp.asarray(offsets(size), jnp.int32))[0]
+    return scan(step, zero, jnp.asarray(offsets(size), jnp.int32))[0]
 
 
 def _lit_share(texels: Texels, places: Places, size: int) -> Float[Array, "*place"]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Num, UInt32
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, is_concrete, option, whole_number
+from jaxfx._meshes import on_any_mesh
 from jaxfx.shadow._at_edges import filtered_at_edges
 from jaxfx.shadow._edges import find_edges
 from jaxfx.shadow.arguments import filter_arguments
@@ -37,6 +38,7 @@ class Candidates(NamedTuple):
     comparisons: UInt32[Array, ""]
 
 
+@on_any_mesh
 def edge_pcf(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
@@ -103,6 +105,7 @@ def edge_pcf(
     return _edge_pcf(size, kernel, edges, dilation, *arguments)
 
 
+@on_any_mesh
 def candidates(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,

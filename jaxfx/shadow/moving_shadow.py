@@ -3,13 +3,13 @@
 from typing import Any, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_light
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, check_map, parameter, whole_number
+from jaxfx._loops import scan
 from jaxfx._numerics import clip01
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -142,7 +142,7 @@ def _visibility(shadow, light):
         return covered + weight * _smoothstep(height / shadow.softness), None
 
     taps = jnp.arange(size**2, dtype=jnp.int32)
-    covered, _ = jax.lax.scan(add, jnp.zeros_like(depth), taps)
+    covered, _ = scan(add, jnp.zeros_like(depth), taps)
     return jnp.where(shadow.shown, 1 - _smoothstep(covered), 1)
 
 

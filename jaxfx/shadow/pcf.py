@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber
+from jaxfx._meshes import on_any_mesh
 from jaxfx.shadow.arguments import filter_arguments
 from jaxfx.shadow.compare import (
     Kernel,
@@ -21,6 +22,7 @@ from jaxfx.shadow.compare import (
 from jaxfx.shadow.receivers import Receivers
 
 
+@on_any_mesh
 def hard(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
@@ -70,6 +72,7 @@ def hard(
     return jax.lax.stop_gradient(filtered(*arguments, 1, "box"))
 
 
+@on_any_mesh
 def prefiltered(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,
@@ -126,6 +129,7 @@ def _prefiltered(shadow_map, receivers, bias, slope_bias, size):
     return compare(mean, places.threshold, None).astype(receivers.z.dtype)
 
 
+@on_any_mesh
 def pcf(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,

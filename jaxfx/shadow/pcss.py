@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Num
 from jaxfx._arguments import check_camera
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, parameter
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import absolute, clip01, safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.shadow.arguments import filter_arguments
@@ -17,6 +18,7 @@ from jaxfx.shadow.compare import compare, offsets, per_place, read_texel, set_up
 from jaxfx.shadow.receivers import Receivers
 
 
+@on_any_mesh
 def pcss(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,

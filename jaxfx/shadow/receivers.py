@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfx._arguments import check_camera
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, check_map, items, parameter
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import absolute, normalize, safe_divide, safe_sqrt, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
@@ -42,6 +43,7 @@ class Receivers(NamedTuple):
     slope: Float[Array, "height width"]
 
 
+@on_any_mesh
 def receivers(
     depth: Num[ArrayLike, "height width"],
     camera: PinholeCamera | OrthographicCamera,

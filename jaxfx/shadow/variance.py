@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, parameter
+from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
 from jaxfx._sampling import bilinear
 from jaxfx.shadow.arguments import filter_arguments
@@ -22,6 +23,7 @@ from jaxfx.shadow.receivers import Receivers
 _FARTHEST = 1e12
 
 
+@on_any_mesh
 def variance(
     shadow_map: Num[ArrayLike, "rows columns"],
     receivers: Receivers,

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfx._loops import fori_loop, scan
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._adjoint import Program
@@ -100,7 +101,7 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
             # One run after the other, or all of them would take memory at once.
             sheet, state = jax.lax.optimization_barrier((sheet, state))
             add = ft.partial(_add_group, ft.partial(visit, sheet, number), first, size, reach)
-            state = jax.lax.fori_loop(0, groups, add, state)
+            state = fori_loop(0, groups, add, state)
     return state
 
 
@@ -110,7 +111,7 @@ def _each_column(add: Callable[..., Any], sums: Array, across: int) -> Array:
     As a scan, it is traced once; unrolled where it is lowered, all taps are one kernel.
     """
     columns = jnp.arange(-across, across + 1)
-    return jax.lax.scan(add, sums, columns, unroll=2 * across + 1)[0]
+    return scan(add, sums, columns, unroll=2 * across + 1)[0]
 
 
 def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> Array:
@@ -159,7 +160,7 @@ def _arriving(
     # Made here, or those of all groups would be made at once.
     value, zero = jax.lax.optimization_barrier((value, jnp.zeros((), value.dtype)))
     nothing = jnp.broadcast_to(zero, (count, len(value), height, width))
-    return jax.lax.fori_loop(0, 2 * reach + 1, turn, nothing)
+    return fori_loop(0, 2 * reach + 1, turn, nothing)
 
 
 def _away(
@@ -175,7 +176,7 @@ def _filled(extent: Extent, sheets: Sheets) -> Filling:
         indices = number * APART + first + jnp.arange(count)
         arriving = _arriving(extent, sheet, first, count, reach)
         add_slice = lambda state, each: (fill(each[0], each[1], state), None)
-        return jax.lax.scan(add_slice, state, (indices, arriving), unroll=count)[0]
+        return scan(add_slice, state, (indices, arriving), unroll=count)[0]
 
     return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
 
@@ -208,7 +209,7 @@ def adjoint(
             seen, carry = read_slice(reading, each[0], each[1], carry)
             return carry, seen
 
-        carry, bar = jax.lax.scan(read_next, carry, (indices, arriving), unroll=count)
+        carry, bar = scan(read_next, carry, (indices, arriving), unroll=count)
         found = _read_back(extent, sheet, first, reach, bar)
         bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
         return bars, carry
@@ -280,7 +281,7 @@ def _read_back(
 
     zero = jnp.zeros_like(sheet.radius)
     sums = jnp.zeros_like(value), zero, zero, zero, zero
-    of_value, of_tilt_x, of_radius, of_tilt_y, of_place = jax.lax.fori_loop(
+    of_value, of_tilt_x, of_radius, of_tilt_y, of_place = fori_loop(
         0, 2 * reach + 1, turn, sums
     )
     found = Sheets(of_value, of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._loops import cond, scan
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._adjoint import with_adjoint
@@ -124,23 +125,23 @@ def plain(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height wi
                 cover = clip01(end + edge) - clip01(start + edge)
                 return sums + sum_planes(cover[:, None] * there(row_light)), None
 
-            return jax.lax.scan(jax.checkpoint(add_tap), sums, jnp.arange(-across, across + 1))
+            return scan(jax.checkpoint(add_tap), sums, jnp.arange(-across, across + 1))
 
         nothing = jnp.zeros((value.shape[1], height, width), value.dtype)
         rows = jnp.arange(-reach, reach + 1)
-        return jax.lax.scan(jax.checkpoint(add_row), nothing, rows)[0]
+        return scan(jax.checkpoint(add_row), nothing, rows)[0]
 
     def add(state, index):
         light, late = state
         some = (share_of(place - index.astype(place.dtype)) > 0).any()
-        arrived = jax.lax.cond(some, arriving, lambda _: jnp.zeros_like(light), index)
+        arrived = cond(some, arriving, lambda _: jnp.zeros_like(light), index)
         allowed, weight, _ = allowance(arrived, light)
         found = allowed[None] * arrived
         return (light + found, late + weight[None] * found), None
 
     nothing = jnp.zeros((value.shape[1], height, width), value.dtype)
     slices = jnp.arange(-SLICES, SLICES + 1 + (len(value) - 1) * APART)
-    return jnp.concatenate(jax.lax.scan(jax.checkpoint(add), (nothing, nothing), slices)[0])
+    return jnp.concatenate(scan(jax.checkpoint(add), (nothing, nothing), slices)[0])
 
 
 _composited = with_adjoint(_forward, _tangent, _adjoint, plain, SHEET_ROWS)

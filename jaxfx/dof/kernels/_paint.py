@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfx._loops import fori_loop
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
@@ -176,9 +177,7 @@ class _Blocks:
         """Fold `visit(index, carry)` over the blocks that hold a sprite."""
         empty = self.reaches < 0
         order = jnp.argsort(empty)
-        return jax.lax.fori_loop(
-            0, jnp.sum(~empty), lambda i, carry: visit(order[i], carry), carry
-        )
+        return fori_loop(0, jnp.sum(~empty), lambda i, carry: visit(order[i], carry), carry)
 
     def each_row(self, index, radius, visit, carry, *, slopes):
         """Fold `visit(carry, side, end, cells, slope)` over the rows of a block's sprites.
@@ -208,7 +207,7 @@ class _Blocks:
             return carry, upper
 
         lower = [-z for z in segment_integral(radius, jnp.asarray(0.5, radius.dtype), slopes)]
-        return jax.lax.fori_loop(0, self.reaches[index] + 1, add_row, (carry, lower))[0]
+        return fori_loop(0, self.reaches[index] + 1, add_row, (carry, lower))[0]
 
 
 def _add(steps: Array, cell: Array, step: Array) -> Array:

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
+from jaxfx._loops import fori_loop
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._taps import Sweep, inside
@@ -84,7 +85,7 @@ def _sums(
             sums = add_row(index * rows + row, sums)
         return sums
 
-    sums = jax.lax.fori_loop(0, turns, turn, sums)
+    sums = fori_loop(0, turns, turn, sums)
     return [jnp.stack(x) if isinstance(x, list) else x for x in sums]
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._loops import scan
 from jaxfx.dof.sprites import Sprites, coverage, leak_rejection, row_half_width
 
 
@@ -40,7 +41,7 @@ def shift(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
             weight = weight * leak_rejection(column_of(row_leak, column), coc, epsilon)
             return sums + weight[..., None] * column_of(row_value, column), None
 
-        return jax.lax.scan(jax.checkpoint(add_tap), sums, offsets)
+        return scan(jax.checkpoint(add_tap), sums, offsets)
 
     sums = jnp.zeros((height, width, value.shape[-1]), value.dtype)
-    return jax.lax.scan(jax.checkpoint(add_row), sums, offsets)[0]
+    return scan(jax.checkpoint(add_row), sums, offsets)[0]

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfx._loops import cond, fori_loop
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._paint import _add, _read
@@ -238,10 +239,10 @@ class Grid:
             held = (share_of(place - index.astype(place.dtype)) > 0).any(axis=1)
             count = held.sum()
             some = lambda carry: visit(index, jnp.argsort(~held), count, carry)
-            return jax.lax.cond(count > 0, some, lambda carry: carry, carry)
+            return cond(count > 0, some, lambda carry: carry, carry)
 
         first, last = jnp.floor(low).astype(int), jnp.ceil(high).astype(int)
-        return jax.lax.fori_loop(first, last + 1, add, carry)
+        return fori_loop(first, last + 1, add, carry)
 
     def paint(
         self,
@@ -296,7 +297,7 @@ class Grid:
             there = jax.lax.dynamic_slice(canvas, at, painted.shape)
             return jax.lax.dynamic_update_slice(canvas, there + painted, at)
 
-        canvas = jax.lax.fori_loop(0, count, paint_block, self._canvas(channels, discs.dtype))
+        canvas = fori_loop(0, count, paint_block, self._canvas(channels, discs.dtype))
         y, x = 2 * self.reach, self.reach + self.across
         return canvas[:, y : y + self.height, x : x + self.width]
 
@@ -355,7 +356,7 @@ class Grid:
 
             return self._each_chunk(index, blocks[n], discs, read_chunk, bars)
 
-        return jax.lax.fori_loop(0, count, read_block, bars)
+        return fori_loop(0, count, read_block, bars)
 
     def _canvas(self, channels: int, dtype: Any) -> Float[Array, "value rows columns"]:
         (down, across), (tall, wide) = self.blocks, self.block
@@ -394,7 +395,7 @@ class Grid:
                 tap = None if column is None else jnp.tile(column, chunk)
                 return visit(carry, block, mine, of_slice, slope, tap)
 
-            return jax.lax.fori_loop(0, -(-count // chunk), each, carry)
+            return fori_loop(0, -(-count // chunk), each, carry)
 
         held = share_of(beyond) > 0
         carry = fold(carry, held & ~bright, CHUNK, None)
@@ -443,4 +444,4 @@ class Grid:
         # The integral up to -1/2, the lower border of the middle row: it is odd in the height.
         lower = [-z for z in segment_integral(radius, jnp.asarray(0.5, disc.dtype), slopes)]
         rows = jnp.ceil(largest - POINT_RADIUS).astype(int) + 1
-        return jax.lax.fori_loop(0, rows, add_row, (carry, lower))[0]
+        return fori_loop(0, rows, add_row, (carry, lower))[0]

@@ -21,6 +21,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
+from jaxfx._loops import fori_loop, switch
 from jaxfx._platform import by_platform
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
@@ -120,22 +121,22 @@ def _sweep(
                 if halo <= NEAR:
                     return sums
                 far = lambda run, sums: add(sums, *_far_run(halo, runs, run, sprite.dtype))
-                return jax.lax.fori_loop(0, 2 * runs, far, sums)
+                return fori_loop(0, 2 * runs, far, sums)
 
             # The middle row is its own mirror image.
-            return jax.lax.fori_loop(0, jnp.where(row > 0, 2, 1), add_side, sums), upper
+            return fori_loop(0, jnp.where(row > 0, 2, 1), add_side, sums), upper
 
         nothing = [jnp.zeros((tall, wide), sprite.dtype)] * (2 if slopes else 1)
         shapes = jax.eval_shape(tap, *nothing, mine, [x[..., :tall, :wide] for x in theirs])
         sums = [jnp.zeros(x.shape, x.dtype) for x in shapes]
         lower = [-x for x in segment_integral(sprite, jnp.asarray(0.5, sprite.dtype), slopes)]
-        return jax.lax.fori_loop(0, reaches[index] + 1, add_row, (sums, lower))[0]
+        return fori_loop(0, reaches[index] + 1, add_row, (sums, lower))[0]
 
     branches = [ft.partial(tile, halo) for halo in halos]
 
     def one(index):
         fitting = jnp.searchsorted(jnp.asarray(halos), reaches[index])
-        return jax.lax.switch(fitting, branches, index)
+        return switch(fitting, branches, index)
 
     def assembled(tiles):
         tiles = tiles.reshape(rows, columns, -1, tall, wide).transpose(2, 0, 3, 1, 4)
