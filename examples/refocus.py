@@ -43,6 +43,8 @@ LARGEST_COC = 0.025
 FOCAL_PER_WIDTH = 0.5 / math.tan(math.radians(30))
 # Scene units of one step of an integer depth where no scale is given.
 MILLI = 1e-3
+# The range of what is computed with.
+TINY, HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 # Options of a disparity: of a pair of cameras, and of a network.
 OF_PAIR = ("--baseline", "--offset")
 OF_NETWORK = ("--disparity-scale", "--disparity-shift")
@@ -71,6 +73,8 @@ def positive(text: str) -> float:
         value = math.nan
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r:.60}")
+    if not TINY <= value <= HUGE:
+        raise argparse.ArgumentTypeError(f"must be a number of float32, got {text!r:.60}")
     return value
 
 
