@@ -7,8 +7,9 @@ from typing import NoReturn
 
 
 def fail(message: object) -> NoReturn:
-    """End the program with an error message."""
-    sys.exit(f"{Path(sys.argv[0]).name}: error: {message}")
+    """End the program with an error message, on one line whatever a file is called."""
+    line = " ".join(str(message).splitlines())
+    sys.exit(f"{Path(sys.argv[0]).name}: error: {line}")
 
 
 def make_folder(folder: Path) -> Path:

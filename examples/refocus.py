@@ -14,7 +14,7 @@ them one figure, `refocus.png`.
 
 Kinds of files are told from their content, not from their names. Where the depth is missing (0,
 negative or NaN) it is filled by `jaxfx.depth.fill`; inf, and the 1e10 and 65504 of renderers,
-is background.
+is background. What is transparent is shown over black.
 """
 
 import argparse
@@ -43,16 +43,25 @@ LARGEST_COC = 0.025
 FOCAL_PER_WIDTH = 0.5 / math.tan(math.radians(30))
 # Scene units of one step of an integer depth where no scale is given.
 MILLI = 1e-3
-# Options that a depth does not have: with one of them DEPTH is a disparity.
-OF_DISPARITY = ("baseline", "offset", "disparity_scale", "disparity_shift")
+# The range of what is computed with.
+TINY, HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+# Options of a disparity: of a pair of cameras, and of a network.
+OF_PAIR = ("--baseline", "--offset")
+OF_NETWORK = ("--disparity-scale", "--disparity-shift")
+# Options of a file DEPTH.
+OF_FILE = ("--depth-layer", "--disparity")
+# A circle of confusion, in pixels, that is not refused for exceeding a small image.
+COC_OF_ANY_SIZE = 64
+# The first bytes of an EXR file, whose alpha is premultiplied.
+EXR = b"v/1\x01"
 
 
 def number(text: str) -> float:
-    """Any number, as 0.0002 or as 1/5000."""
+    """Any finite number, as 0.0002 or as 1/5000."""
     try:
         value = float(Fraction(text))
-    except (ValueError, ZeroDivisionError):
-        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from None
+    except (ValueError, ArithmeticError):
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r:.60}") from None
     return value
 
 
@@ -63,7 +72,9 @@ def positive(text: str) -> float:
     except argparse.ArgumentTypeError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text!r:.60}")
+    if not TINY <= value <= HUGE:
+        raise argparse.ArgumentTypeError(f"must be a number of float32, got {text!r:.60}")
     return value
 
 
@@ -97,7 +108,8 @@ def parse() -> argparse.Namespace:
         nargs="+",
         help="depths in scene units, or pixels X,Y; without it, the median depth",
     )
-    add("--layer", help="the layer of an EXR file that has several")
+    add("--layer", help="the layer of COLOR, an EXR file that has several")
+    add("--depth-layer", help="the layer of DEPTH, an EXR file that has several")
     add("--behind", help="the layer of COLOR that shows what the first one hides")
     add("--aperture", type=positive, help="diameter of the lens, scene units")
     add("--focal", type=positive, help="focal length in pixels; without it, 60 degrees across")
@@ -109,7 +121,7 @@ def parse() -> argparse.Namespace:
     )
     add("--ray", action="store_true", help="DEPTH is the distance along each pixel's ray")
     add("--disparity", action="store_true", help="DEPTH is a disparity, larger where nearer")
-    add("--disparity-scale", type=number, help="1 / depth for a step of the disparity")
+    add("--disparity-scale", type=positive, help="1 / depth for a step of the disparity")
     add("--disparity-shift", type=number, default=0.0, help="1 / depth where it is 0")
     add("--baseline", type=positive, help="of a pair of cameras, scene units; needs --focal")
     add("--offset", type=number, default=0.0, help="the pair's `doffs`, pixels")
@@ -120,19 +132,35 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def colors(image: np.ndarray) -> np.ndarray:
-    """An image without its alpha."""
-    return image[..., : 3 if image.shape[2] > 2 else 1]
+def colors(image: np.ndarray, *, is_straight: bool = False) -> np.ndarray:
+    """An image without its alpha, over black; with straight alpha it is not yet multiplied."""
+    channels = 3 if image.shape[2] > 2 else 1
+    has_alpha = image.shape[2] in (2, 4)
+    return image[..., :channels] * (image[..., -1:] if has_alpha and is_straight else 1)
+
+
+def check_options(arguments: argparse.Namespace) -> None:
+    """`ValueError` for an option that would be left out."""
+    given = [f"--{name.replace('_', '-')}" for name, value in vars(arguments).items() if value]
+    if arguments.depth is None and (of_file := [name for name in OF_FILE if name in given]):
+        raise ValueError(f"{of_file[0]} must have a file DEPTH of its own")
+    of_disparity = [name for name in given if name in OF_PAIR + OF_NETWORK]
+    if of_disparity and not arguments.disparity:
+        raise ValueError(f"{of_disparity[0]} must have --disparity")
+    if arguments.baseline and (of_network := [name for name in given if name in OF_NETWORK]):
+        raise ValueError(f"{of_network[0]} must be without --baseline, of a pair")
+    if arguments.offset and not arguments.baseline:
+        raise ValueError("--offset must have --baseline and --focal of a pair")
+    if arguments.behind is not None and arguments.method != "layered":
+        raise ValueError(f"--behind must have --method layered, got {arguments.method}")
 
 
 def read_depth(arguments: argparse.Namespace) -> np.ndarray:
     """Depth in scene units along the axis, height width, float32; NaN where it is missing."""
-    is_depth = not arguments.disparity
-    if is_depth and (given := [name for name in OF_DISPARITY if getattr(arguments, name)]):
-        raise ValueError(f"--{given[0].replace('_', '-')} must have --disparity")
-    stored = io.read_depth(arguments.depth)
-    scale = arguments.depth_scale or (MILLI if is_depth and stored.dtype.kind in "iu" else 1.0)
-    if is_depth:
+    stored = io.read_depth(arguments.depth, layer=arguments.depth_layer)
+    is_integer = stored.dtype.kind in "iu"
+    scale = arguments.depth_scale or (MILLI if is_integer and not arguments.disparity else 1.0)
+    if not arguments.disparity:
         depth = depths.clean(stored, unit=scale)
     elif arguments.baseline and arguments.focal:
         depth = depths.from_stereo(
@@ -141,7 +169,7 @@ def read_depth(arguments: argparse.Namespace) -> np.ndarray:
             baseline=arguments.baseline,
             disparity_offset=arguments.offset,
         )
-    elif arguments.disparity_scale and not arguments.baseline:
+    elif arguments.disparity_scale:
         depth = depths.from_disparity(
             stored * np.float32(scale),
             scale=arguments.disparity_scale,
@@ -156,26 +184,46 @@ def read_depth(arguments: argparse.Namespace) -> np.ndarray:
 
 def read(arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
     """The image and its depth, with holes."""
+    check_options(arguments)
     if arguments.depth is None:
-        image, depth = exr.read_rgbd(arguments.color, layer=arguments.layer)
-        scale = arguments.depth_scale or 1.0
-        if arguments.disparity:
-            raise ValueError("--disparity must have a file DEPTH of its own")
-        depth = np.asarray(depths.clean(depth, unit=scale))
-    else:
-        image = io.read_color(arguments.color, layer=arguments.layer)
-        depth = read_depth(arguments)
+        return read_layer(arguments, arguments.layer)
+    image = io.read_color(arguments.color, layer=arguments.layer)
+    with arguments.color.open("rb") as file:
+        is_straight = file.read(len(EXR)) != EXR
+    depth = read_depth(arguments)
     if depth.shape != image.shape[:2]:
         raise ValueError(
             f"both files must have one height and width, got {image.shape[:2]} and "
             f"{depth.shape}"
         )
+    return colors(image, is_straight=is_straight), along_axis(depth, arguments)
+
+
+def read_layer(
+    arguments: argparse.Namespace, layer: str | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The image and the depth of a layer of COLOR, with holes.
+
+    Beside a file DEPTH, what is said of its numbers does not hold for those of COLOR.
+    """
+    image, depth = exr.read_rgbd(arguments.color, layer=layer)
+    if arguments.depth is None:
+        depth = np.asarray(depths.clean(depth, unit=arguments.depth_scale or 1.0))
+        depth = along_axis(depth, arguments)
     return colors(image), depth
 
 
-def along_axis(depth: np.ndarray, focal: float) -> np.ndarray:
-    """Depth along the axis from distance along rays, of a camera centered on the image."""
+def focal_length(arguments: argparse.Namespace, width: int) -> float:
+    """In pixels."""
+    return arguments.focal or FOCAL_PER_WIDTH * width
+
+
+def along_axis(depth: np.ndarray, arguments: argparse.Namespace) -> np.ndarray:
+    """Depth along the axis; with `--ray`, from distance, of a camera centered on the image."""
+    if not arguments.ray:
+        return depth
     height, width = depth.shape
+    focal = focal_length(arguments, width)
     matrix = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     return np.asarray(depths.from_ray_distance(depth, PinholeCamera(matrix, np.eye(4))))
 
@@ -184,16 +232,13 @@ def read_behind(arguments: argparse.Namespace, shape: tuple[int, ...]) -> tuple 
     """A second layer of COLOR, for `layered`; None where none is asked for."""
     if arguments.behind is None:
         return None
-    if arguments.method != "layered":
-        raise ValueError(f"--behind must have --method layered, got {arguments.method}")
-    image, depth = exr.read_rgbd(arguments.color, layer=arguments.behind)
+    image, depth = read_layer(arguments, arguments.behind)
     if depth.shape != shape:
         raise ValueError(
             f"--behind must have the first layer's size {shape}, got {depth.shape}"
         )
-    depth = np.asarray(depths.clean(depth, unit=arguments.depth_scale or 1.0))
     # Where the second layer is missing there is nothing behind the first.
-    return colors(image), np.where(np.isnan(depth), np.float32(np.inf), depth)
+    return image, np.where(np.isnan(depth), np.float32(np.inf), depth)
 
 
 def focus_depth(chosen: float | tuple[int, int], depth: np.ndarray) -> float:
@@ -209,7 +254,7 @@ def focus_depth(chosen: float | tuple[int, int], depth: np.ndarray) -> float:
 
 def widest(depth: np.ndarray, distance: float, focal: float, width: int) -> float:
     """The aperture whose largest circle of confusion is `LARGEST_COC` of the width."""
-    unit = float(np.max(np.abs(1 / distance - 1 / depth)))
+    unit = float(np.max(np.abs(1 / distance - 1 / depth.astype(np.float64))))
     return LARGEST_COC * width / (focal * max(unit, 1e-6))
 
 
@@ -223,7 +268,8 @@ def save_figure(images: dict, depth: np.ndarray, filled: np.ndarray, path: Path)
     rows = count // columns
     height, width = depth.shape
     # Width for the images and the color bar of the depth, height for images and titles.
-    size = (4.6 * columns + 0.6, (4.6 * height / width + 0.45) * rows)
+    # At most twice as high as wide: at its own shape, a column of pixels takes all memory.
+    size = (4.6 * columns + 0.6, (4.6 * min(height / width, 2) + 0.45) * rows)
     figure = Figure(figsize=size, layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     for ax, (title, image) in zip(axes[:1] + axes[2:], images.items(), strict=True):
@@ -245,38 +291,58 @@ def save_figure(images: dict, depth: np.ndarray, filled: np.ndarray, path: Path)
     write_whole(path, buffer.getvalue())
 
 
+def names(distances: list[float]) -> list[str]:
+    """Of the foci, with as many digits as tell them apart."""
+    digits = next(
+        (n for n in (5, 9) if len({f"{d:.{n}g}" for d in distances}) == len(distances)), 17
+    )
+    return [f"{distance:.{digits}g}" for distance in distances]
+
+
+def refocus(arguments: argparse.Namespace, out: Path) -> None:
+    """Read the image and its depth, and write every file to the folder `out`."""
+    color, depth = read(arguments)
+    behind = read_behind(arguments, depth.shape)
+    height, width = depth.shape
+    focal = focal_length(arguments, width)
+    if not (depth > 0).any():
+        raise ValueError(f"`{arguments.depth or arguments.color}` must have a depth above 0")
+    whole = depths.fill(depth, color, method=arguments.fill)
+    depth, filled = np.asarray(whole.depth), np.asarray(whole.filled)
+    chosen = arguments.focus or [float(np.median(depth))]
+    distances = [*dict.fromkeys(focus_depth(choice, depth) for choice in chosen)]
+
+    images = {"photograph": color}
+    options = {} if behind is None else {"behind": behind}
+    for distance, name in zip(
+        tqdm(distances, "focus", leave=False), names(distances), strict=True
+    ):
+        aperture = arguments.aperture or widest(depth, distance, focal, width)
+        lens = ThinLens(aperture, distance, focal)
+        circles = np.asarray(lens.circle_of_confusion(jnp.asarray(depth)))
+        largest = float(circles.max())
+        limit = arguments.max_coc or max(math.hypot(height, width), COC_OF_ANY_SIZE)
+        if largest > limit and not arguments.max_coc:
+            raise ValueError(
+                f"--aperture must be in the unit of DEPTH, got {aperture:g}: a circle of "
+                f"confusion of {largest:.3g} pixels exceeds the image; --max-coc cuts it"
+            )
+        max_coc = min(max(largest, 1.0), limit)
+        method = METHODS[arguments.method]
+        image = np.asarray(method(color, depth, lens, max_coc=max_coc, **options))
+        exr.write(out / f"focus_{name}.exr", {"": image, "depth": depth, "coc": circles})
+        io.write_png(out / f"focus_{name}.png", image)
+        images[f"focus at {name}, circles up to {min(largest, max_coc):.0f} pixels"] = image
+    save_figure(images, depth, filled, out / "refocus.png")
+
+
 def main() -> None:
     arguments = parse()
     out = make_folder(arguments.out)
     try:
-        color, depth = read(arguments)
-        behind = read_behind(arguments, depth.shape)
-        width = depth.shape[1]
-        focal = arguments.focal or FOCAL_PER_WIDTH * width
-        if arguments.ray:
-            depth = along_axis(depth, focal)
-        whole = depths.fill(depth, color, method=arguments.fill)
-        depth, filled = np.asarray(whole.depth), np.asarray(whole.filled)
-        chosen = arguments.focus or [float(np.median(depth))]
-        distances = [focus_depth(choice, depth) for choice in chosen]
+        refocus(arguments, out)
     except (OSError, ValueError) as error:
         fail(error)
-
-    images = {"photograph": color}
-    options = {} if behind is None else {"behind": behind}
-    for distance in tqdm(distances, "focus", leave=False):
-        aperture = arguments.aperture or widest(depth, distance, focal, width)
-        lens = ThinLens(aperture, distance, focal)
-        circles = np.asarray(lens.circle_of_confusion(jnp.asarray(depth)))
-        max_coc = arguments.max_coc or max(float(circles.max()), 1.0)
-        method = METHODS[arguments.method]
-        image = np.asarray(method(color, depth, lens, max_coc=max_coc, **options))
-        name = f"focus_{distance:.5g}"
-        exr.write(out / f"{name}.exr", {"": image, "depth": depth, "coc": circles})
-        io.write_png(out / f"{name}.png", image)
-        largest = min(max_coc, float(circles.max()))
-        images[f"focus at {distance:.3g}, circles up to {largest:.0f} pixels"] = image
-    save_figure(images, depth, filled, out / "refocus.png")
     print(f"images in {out}")
 
 

@@ -83,6 +83,10 @@ def _all_positive(*values: Array) -> Array:
     return jnp.stack([value > 0 for value in values]).all()
 
 
+# Width of a sensor over the focal length. Rectilinear lenses have up to 4, telescopes down
+# to 1/500; millimetres taken for metres make it 1000 times as large or as small.
+MIN_SENSOR_PER_FOCAL, MAX_SENSOR_PER_FOCAL = 1e-3, 50.0
+
 _positive = lambda v: v > 0
 _not_negative = lambda v: v >= 0
 
@@ -270,7 +274,8 @@ class ThinLens(eqx.Module):
         `aperture` is `focal_length / f_number`.
 
         **Raises:** `ValueError` for a number that is not positive, or a focus distance within
-        the focal length, as millimetres beside metres give it.
+        the focal length or a ratio of sensor and focal length that no lens has, as millimetres
+        beside metres give them.
 
         **Gradient:** exact.
 
@@ -297,6 +302,13 @@ class ThinLens(eqx.Module):
         # Blender's own numbers, 50 mm and 2.6 m, would be a lens 17.9 m wide at f/2.8.
         expected = "beyond `focal_length`, both in one unit (focus_distance - focal_length > 0)"
         check(name, distance - focal_length, _positive, expected)
+        # One in metres and one in millimetres: a view of 180 degrees, or of a tenth of one.
+        check(
+            "from_sensor(sensor_width)",
+            sensor_width / focal_length,
+            lambda v: (v > MIN_SENSOR_PER_FOCAL) & (v < MAX_SENSOR_PER_FOCAL),
+            "in the unit of `focal_length` (sensor_width / focal_length from 1/1000 to 50)",
+        )
         width = whole_number("from_sensor(width)", width)
         return cls(focal_length / f_number, distance, focal_length / sensor_width * width)
 

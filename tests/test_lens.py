@@ -403,6 +403,10 @@ def sensor(**changes):
             lambda: sensor(focus_distance=2.6),
             r"`from_sensor\(focus_distance\)` must be beyond `focal_length`, both in one unit",
         ),
+        *(
+            (lambda factor=factor: sensor(sensor_width=36 * factor), r"unit of `focal_length`")
+            for factor in (1e3, 1e-3)
+        ),
     ],
 )
 def test_errors(call, message):

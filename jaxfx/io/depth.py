@@ -91,7 +91,9 @@ def _from_exr(path: StrPath, layer: str | None) -> np.ndarray:
     if depths or layer is not None:
         return flat(layers[depths[choose(path, "a depth", depths, layer)]])
     if [*layers] not in ([""], ["R"], ["V"]):
-        raise ValueError(f"`{path}` must have a pass `Depth` or `Z`, got {sorted(layers)}.")
+        raise ValueError(
+            f"`{path}` must have a pass `Depth` or `Z` of one channel, got {sorted(layers)}."
+        )
     (array,) = layers.values()
     return _one_channel(path, array[..., :3] if array.ndim == 3 else array)
 
@@ -123,9 +125,11 @@ def _from_numpy(path: StrPath, data: bytes) -> np.ndarray:
         loaded = np.load(BytesIO(data), allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             return loaded
-        arrays = {name: loaded[name] for name in loaded.files}
+        # An archive may hold files that are no arrays: of those, NumPy returns the bytes.
+        members = {name: loaded[name] for name in loaded.files}
     except Exception as error:
         raise ValueError(f"`{path}` is damaged or not of NumPy: {error}") from error
+    arrays = {name: array for name, array in members.items() if isinstance(array, np.ndarray)}
     names = arrays if len(arrays) == 1 else arrays.keys() & {"depth"}
     if not names:
         raise ValueError(

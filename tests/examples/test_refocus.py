@@ -3,6 +3,7 @@
 import importlib.util
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxfx import exr, io
 SCRIPT = Path(__file__).parents[2] / "examples" / "refocus.py"
 HEIGHT, WIDTH = 30, 40
 NEAR, FAR = 1.0, 2.0
+PAIR = ("color.png", "depth.png", "--disparity", "--baseline", "1", "--focal", "9")
 
 
 def is_card():
@@ -45,6 +47,17 @@ def example():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def options(example, monkeypatch):
+    """The script's options, without running it."""
+
+    def parsed(*arguments):
+        monkeypatch.setattr(sys, "argv", ["refocus.py", *map(str, arguments)])
+        return example.parse()
+
+    return parsed
 
 
 @pytest.fixture
@@ -120,19 +133,44 @@ def test_a_scale_may_be_a_fraction(photograph, main):
         (("color.png", "depth.png", "--disparity", "--baseline", "1"), "and --focal of a pair"),
         (("color.png", "depth.png", "--baseline", "1"), "--baseline must have --disparity"),
         (("color.png", "depth.png", "--disparity-shift", "1"), "-shift must have --disparity"),
+        (("depth.exr", "--offset", "1"), "--offset must have --disparity"),
+        (("depth.exr", "--depth-layer", "x"), "--depth-layer must have a file DEPTH"),
+        (("color.png", "depth.png", "--depth-layer", "x"), "`depth.png` must be an EXR file"),
+        (
+            (
+                "color.png",
+                "depth.png",
+                "--disparity",
+                "--disparity-scale",
+                "1",
+                "--offset",
+                "1",
+            ),
+            "--offset must have --baseline",
+        ),
+        (
+            (*PAIR, "--disparity-shift", "1"),
+            "--disparity-shift must be without --baseline",
+        ),
+        (("color.png", "notes.npz"), r"`notes.npz` must have one array, .* got \[\]"),
+        (("two\nlines.png", "depth.png"), "`two lines.png` must be a PNG, JPEG or EXR file"),
+        (("color.png", "depth.png", "--focus", "1", "--aperture", "1e6"), "exceeds the image"),
         (("color.png", "depth.png", "--behind", "x"), "must be an OpenEXR file"),
         (
             ("color.png", "depth.png", "--behind", "x", "--method", "scatter"),
             "--behind must have --method layered",
         ),
         (("color.png", "small.png"), r"one height and width, got \(30, 40\) and \(5, 5\)"),
-        (("color.png", "empty.png"), "must be known somewhere"),
+        (("color.png", "empty.png"), "`empty.png` must have a depth above 0"),
         (("color.png", "depth.png", "--focus", "40,3"), "must lie in the 40 x 30 image"),
         (("color.png", "depth.png", "--out", "color.png"), "must be a folder to write to"),
     ],
 )
 def test_a_fault_is_one_line_and_nothing_is_written(photograph, main, arguments, message):
     Path("broken.png").write_bytes(b"PNG?")
+    Path("two\nlines.png").write_bytes(b"PNG?")
+    with zipfile.ZipFile("notes.npz", "w") as archive:
+        archive.writestr("notes.txt", "no array")
     Image.fromarray(np.ones((5, 5), np.uint16)).save("small.png")
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save("empty.png")
     with pytest.raises(SystemExit, match=message) as caught:
@@ -218,6 +256,53 @@ def test_one_file_of_blender(photograph, main, behind):
     assert contrast(found[""], inside) == pytest.approx(0.8, abs=0.01)
 
 
+def test_layers_of_depth_are_read_by_name_and_converted_alike(photograph, example, options):
+    multilayer("render.exr")
+    _, depth = example.read(options("color.png", "render.exr", "--depth-layer", "Front"))
+    np.testing.assert_array_equal(depth, np.where(is_card(), NEAR, np.inf))
+
+    # Scale and --ray are said of what COLOR holds, and beside a file DEPTH of that alone.
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ray = np.sqrt(1 + ((x - 20) ** 2 + (y - 15) ** 2) / 30**2)
+    names = ("Front", "Back")
+    passes = {f"{name}.Depth": (1000 * FAR * ray).astype(np.float32) for name in names}
+    exr.write("rays.exr", passes | {f"{name}.Combined": photograph for name in names})
+    said = ("--layer", "Front", "--behind", "Back", "--depth-scale", "1/1000", "--ray")
+    one_file = options("rays.exr", *said, "--focal", 30)
+    for _, depth in (example.read(one_file), example.read_behind(one_file, (HEIGHT, WIDTH))):
+        np.testing.assert_allclose(depth, FAR, rtol=1e-6)
+    _, depth = example.read_behind(options("rays.exr", "depth.png", *said), (HEIGHT, WIDTH))
+    np.testing.assert_allclose(depth, 1000 * FAR * ray, rtol=1e-6)
+
+
+def test_what_is_transparent_is_over_black(photograph, example, options):
+    """Alpha is straight in PNG, premultiplied in EXR: one picture in either."""
+    alpha = np.where(is_card(), 1, np.float32(0.25))[..., None]
+    io.write_png("cut.png", np.concatenate([photograph, alpha], axis=2))
+    exr.write("cut.exr", np.concatenate([photograph * alpha, alpha], axis=2))
+    for name in ("cut.png", "cut.exr"):
+        color, _ = example.read(options(name, "depth.png"))
+        np.testing.assert_allclose(color, photograph * alpha, atol=0.005)
+
+
+def test_foci_that_are_nearly_equal_have_files_of_their_own(example):
+    assert example.names([1.0, 2.5]) == ["1", "2.5"]
+    assert example.names([1.00001, 1.00002]) == ["1.00001", "1.00002"]
+
+
+def test_a_column_of_pixels_has_a_figure_of_a_bearable_size(tmp_path, example):
+    column = np.ones((3000, 1))
+    example.save_figure({"a": column[..., None]}, column, column < 0, tmp_path / "figure.png")
+    with Image.open(tmp_path / "figure.png") as figure:
+        assert figure.height < 2000
+
+
+def test_an_unwritable_file_is_an_error_that_names_it(photograph, main):
+    Path("out/focus_2.exr").mkdir(parents=True)
+    with pytest.raises(SystemExit, match=r"error: .*focus_2\.exr"):
+        main("color.png", "depth.exr", "--focus", FAR, "--method", "scatter")
+
+
 def test_a_photograph_in_jpeg(photograph, main):
     """Whatever its name ends in."""
     smooth = np.broadcast_to(np.linspace(40, 200, WIDTH)[None, :, None], (HEIGHT, WIDTH, 3))
@@ -246,6 +331,23 @@ def test_a_number_that_is_none_is_refused(main, capsys, option):
         main("color.png", "depth.png", option, "0")
     assert caught.value.code == 2
     assert f"argument {option}: must be a number above 0, got '0'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "message"),
+    [
+        ("--focus", "1e-300", "must be a number of float32, got '1e-300'"),
+        ("--aperture", "1e300", "must be a number of float32, got '1e300'"),
+        ("--focal", "inf", "must be a number above 0, got 'inf'"),
+        ("--disparity-scale", "0", "must be a number above 0, got '0'"),
+        ("--offset", "nan", "must be a number, got 'nan'"),
+    ],
+)
+def test_a_number_out_of_range_is_refused(main, capsys, option, text, message):
+    with pytest.raises(SystemExit) as caught:
+        main("color.png", "depth.png", option, text)
+    assert caught.value.code == 2
+    assert f"argument {option}: {message}" in capsys.readouterr().err
 
 
 def test_as_a_user_runs_it(photograph):

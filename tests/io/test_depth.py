@@ -1,6 +1,7 @@
 """Depth from files: the stored numbers, or an error that names the file."""
 
 import inspect
+import zipfile
 
 import numpy as np
 import OpenEXR
@@ -135,6 +136,18 @@ def test_npz(tmp_path):
         io.read_depth(tmp_path / "a.npz")
 
 
+def test_a_text_in_an_npz_is_no_array(tmp_path):
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("depth", "a word")
+    with pytest.raises(ValueError, match=r"a.npz` must have one array.*\[\]"):
+        io.read_depth(path)
+    np.save(tmp_path / "z.npy", metres())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.write(tmp_path / "z.npy", "z.npy")
+    assert_read(path, metres())
+
+
 @pytest.mark.parametrize(
     "array",
     [
@@ -199,7 +212,9 @@ def test_a_channel_alone(tmp_path, name):
 )
 def test_an_exr_file_without_depth_is_refused(tmp_path, channels):
     exr.write(tmp_path / "a.exr", channels)
-    with pytest.raises(ValueError, match=r"a.exr` must have a pass `Depth` or `Z`, got \["):
+    with pytest.raises(
+        ValueError, match=r"a.exr` must have a pass `Depth` or `Z` of one channel, got \["
+    ):
         io.read_depth(tmp_path / "a.exr")
     exr.write(tmp_path / "a.exr", metres(size=(5, 7, 3)))
     with pytest.raises(ValueError, match=r"a.exr` must have one channel of real numbers"):

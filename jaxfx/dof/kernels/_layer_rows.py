@@ -73,6 +73,7 @@ def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
     runs = []
     for low, high in itertools.pairwise(bounds):
         needed, reach = extent.reach_of(thick * (max(-low, high - 1) + 1)), extent.reach
+        # Discs within their own pixel need a reach of 0, at which halving would never end.
         while reach > 1 and needed <= reach // 2:
             reach = reach // 2
         if runs and runs[-1][2:] == (high - low, reach):
