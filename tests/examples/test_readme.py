@@ -50,6 +50,8 @@ def test_every_call_that_it_lists_exists():
 
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+# Pages of the site alone, which link to pages that `docs/build.py` makes; it checks their links.
+PAGES.remove(ROOT / "docs" / "index.md")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
