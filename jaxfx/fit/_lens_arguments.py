@@ -20,6 +20,10 @@ from jaxfx.lens import ThinLens
 # The parameters that are sought by default.
 PARAMETERS = {"scatter": (*LENS, "gamma", "epsilon"), "layered": (*LENS, "threshold")}
 
+# Pixels that share a photograph's largest value, from which on it is taken for saturated. Noise
+# makes such values differ; eight bits may repeat one a few times.
+_PLATEAU = 8
+
 Loss = Literal["robust", "squares"]
 Exposure = Literal["free", "equal"]
 _OPTIONS = {"effect": Effect, "loss": Loss, "tone": Tone, "exposure": Exposure}
@@ -78,6 +82,22 @@ def _references(
         check(name, photograph, np.isfinite, "finite")
         references.append(photograph.astype(image.dtype))
     return jnp.stack(references)
+
+
+def without_saturated(images: Images) -> Images:
+    """The images with weight 0 where a photograph is saturated.
+
+    Its sensor had no more to say there, and the effect has: highlights of 50 times white would
+    decide alone. A channel is saturated where it has its own largest value and `_PLATEAU`
+    pixels share that, unless half of the image does.
+    """
+    references = images.references
+    peak = jnp.max(references, axis=(1, 2), keepdims=True)
+    is_peak = references == peak
+    count = jnp.sum(is_peak, axis=(1, 2), keepdims=True)
+    is_plateau = (count >= _PLATEAU) & (2 * count < references.shape[1] * references.shape[2])
+    is_saturated = jnp.any(is_peak & is_plateau, axis=(0, 3))
+    return images._replace(weights=jnp.where(is_saturated, 0, images.weights))
 
 
 def _behind(behind: Any, image: Array) -> tuple[Array, Array]:

@@ -209,10 +209,11 @@ def dof(
     Photographs show what one image does not hold: surfaces that near ones hide, and highlights.
     So the loss is Huber's, and pixels that a sprite from an edge in depth or of the frame
     reaches have a noise of their own, which is estimated beside that of the others. A pixel
-    that differs by twenty standard deviations is left out. First, lenses of half to twice the
-    aperture and 0.7 to 1.4 times the focus distance are compared on images of at most 160
-    pixels a side. From the best two, and from half and twice the epsilon or the threshold, a
-    search goes on there; the best end is refined on the images as given.
+    that differs by twenty standard deviations is left out, and so is one where the photograph
+    is saturated: where a channel has its own largest value, with seven others at least. First,
+    lenses of half to twice the aperture and 0.7 to 1.4 times the focus distance are compared on
+    images of at most 160 pixels a side. From the best two, and from half and twice the epsilon
+    or the threshold, a search goes on there; the best end is refined on the images as given.
 
     Source: Huber 1964, the loss; Golub & Pereyra 1973, exposure by variable projection. The
     noise near edges, the footprint and the lenses that are compared are our own.
@@ -227,6 +228,8 @@ def dof(
         max_coc = number("dof(max_coc=...)", max_coc, is_diameter, "positive and finite")
     read.check_moves(names, lenses, images, max_coc)
     is_robust, is_free = loss == "robust", exposure == "free"
+    if is_robust:
+        images = read.without_saturated(images)
     if is_robust and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
     model = Model(images, start, jnp.zeros(()), names, effect, 1.0)

@@ -1,10 +1,10 @@
-"""Cases in which fits fail: images that the model of lights lacks, lights that are as one."""
+"""Cases in which fits fail: images that a model lacks, parameters that images do not tell."""
 
 import functools as ft
 
 import numpy as np
 
-from jaxfx import DirectionalLight, fit, relight
+from jaxfx import DirectionalLight, ThinLens, depth as depths, dof, fit, relight
 from tests.cases import lit
 from tests.cases.registry import Found, case
 
@@ -100,3 +100,125 @@ def lights_that_cannot_be_told_apart(loss):
         finite += [np.isfinite(each["color"]).all() for each in found.standard_errors]
     figures = {"successes": float(np.mean(successes)), "finite": float(np.mean(finite))}
     return Found(figures, np.clip(image / 3, 0, 1))
+
+
+# Photographs of 40 x 56 pixels per case of a lens.
+DOF_COUNT = 3
+TRUE_LENS = ThinLens(0.3, 2.0, 60.0)
+START_LENS = ThinLens(0.36, 2.2, 60.0)
+
+
+def _room(seed):
+    """A wall at 4 behind a slanted floor and a box at 1.2, with a texture of several scales."""
+    rng = np.random.default_rng(seed)
+    row, column = np.mgrid[:40, :56]
+    depth = np.minimum(4.0, 60 / (row + 10.0))
+    depth = np.where((abs(row - 18) < 8) & (abs(column - 20) < 9), 1.2, depth)
+    texture = sum(
+        np.kron(rng.random((40 // n, 56 // n, 1)), np.ones((n, n, 1))) for n in (1, 2, 4)
+    )
+    return texture / 3, depth
+
+
+def _blurred(change, loss, **options):
+    """Over `DOF_COUNT` fits: the median of the aperture's relative error; the share of numbers
+    outside of 1.96 stated errors; that of failures."""
+    off, outside, failures = [], [], []
+    reference = image = np.zeros((1, 1, 1))
+    for seed in range(DOF_COUNT):
+        reference, image, depth = change(seed)
+        how = {"loss": loss, "throw": False, "max_coc": 10.0, "gamma": 1.0, **options}
+        fitted = fit.dof(reference, image, depth, START_LENS, **how)
+        off.append(abs(float(fitted.lens.aperture) / 0.3 - 1))
+        for name, truth in (("aperture", 0.3), ("focus_distance", 2.0)):
+            miss = abs(float(getattr(fitted.lens, name)) - truth)
+            outside.append(miss > 1.96 * float(fitted.standard_errors[name]))
+        failures.append(not fitted.success)
+    figures = {
+        "off": float(np.median(off)),
+        "outside": float(np.mean(outside)),
+        "failures": float(np.mean(failures)),
+    }
+    return Found(figures, np.clip(np.concatenate([image, reference], axis=1), 0, 1))
+
+
+def _photograph(seed, image, depth, lens=TRUE_LENS):
+    """What `scatter` makes of it, with noise of half a percent."""
+    drawn = np.asarray(dof.scatter(image, depth, lens, max_coc=16.0))
+    return drawn + 0.005 * np.random.default_rng(seed).normal(size=drawn.shape)
+
+
+DOF_ASKED: dict[str, float | None] = {"off": 0.03, "outside": 0.15, "failures": 0.0}
+
+
+@case("fit", DOF_ASKED, LOSSES, NONE)
+def a_lens_as_the_model_has_it(loss):
+    """A lens 20 and 10 % off at the start, noise of half a percent; 3 images of 40 x 56: the
+    median of the aperture's relative error; the share of apertures and focus distances outside
+    of 1.96 stated errors; the share that is doubted."""
+
+    def plain(seed):
+        image, depth = _room(seed)
+        return _photograph(seed, image, depth), image, depth
+
+    return _blurred(plain, loss)
+
+
+@case("fit", DOF_ASKED, LOSSES, NONE)
+def a_lens_and_saturated_highlights(loss):
+    """The same, with four lights of 50 x white, and the photograph clipped at 1."""
+
+    def clipped(seed):
+        image, depth = _room(seed)
+        lights = np.random.default_rng(seed + 9).integers(0, image.size, 4)
+        image.reshape(-1)[lights] = 50.0
+        return np.minimum(_photograph(seed, image, depth), 1), image, depth
+
+    return _blurred(clipped, loss)
+
+
+@case("fit", DOF_ASKED, ("missing", "filled"), NONE)
+def a_lens_and_depth_with_holes(holes):
+    """The same, unclipped, a fifth of the depth missing in blocks of 4 x 4: left missing, and
+    filled by `depth.fill` first."""
+
+    def holed(seed):
+        image, depth = _room(seed)
+        blocks = np.random.default_rng(seed + 9).random((10, 14)) < 0.2
+        known = np.where(np.kron(blocks, np.ones((4, 4))) > 0, 0.0, depth)
+        if holes == "filled":
+            known = np.asarray(depths.fill(known, image).depth)
+        return _photograph(seed, image, depth), image, known
+
+    return _blurred(holed, "robust")
+
+
+@case("fit", DOF_ASKED | {"failures": None}, ("equal", "free"), NONE)
+def a_lens_and_a_wrong_exposure(exposure):
+    """The same, with all depth, a quarter brighter: with the exposure held equal, and found
+    beside the lens; it need not be doubted."""
+
+    def brighter(seed):
+        image, depth = _room(seed)
+        return 1.25 * _photograph(seed, image, depth), image, depth
+
+    return _blurred(brighter, "robust", exposure=exposure)
+
+
+@case("fit", {"successes": 0.0}, LOSSES, NONE)
+def a_lens_that_cannot_be_seen(loss):
+    """All in focus, and without texture: the share of either that is called a success."""
+    successes = []
+    image = reference = np.zeros((1, 1, 1))
+    for seed in range(DOF_COUNT):
+        image, depth = _room(seed)
+        for flat in (image, np.full_like(image, 0.4)):
+            at = np.full_like(depth, 2.0) if flat is image else depth
+            reference = _photograph(seed, flat, at)
+            how = {"loss": loss, "throw": False, "max_coc": 10.0}
+            start = ThinLens(0.36, 2.6, 60.0)
+            successes.append(fit.dof(reference, flat, at, start, **how).success)
+    return Found(
+        {"successes": float(np.mean(successes))},
+        np.clip(np.concatenate([image, reference], axis=1), 0, 1),
+    )

@@ -50,7 +50,7 @@ def test_every_call_that_it_lists_exists():
 
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-# Pages of the site alone, which link to pages that `docs/build.py` makes; it checks their links.
+# The site's front page links to pages that `docs/build.py` makes, and which it checks.
 PAGES.remove(ROOT / "docs" / "index.md")
 
 
