@@ -399,9 +399,9 @@ def test_any_size_and_batches_of_lights(size):
 
 
 def test_an_unknown_shader_is_named_or_black():
-    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1 or 2"):
-        relight.shade(one_pixel(3), FRONT, LIGHTS["ambient"])
-    assert not jax.jit(relight.shade)(one_pixel(3), FRONT, LIGHTS["ambient"]).any()
+    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1, 2 or 3"):
+        relight.shade(one_pixel(4), FRONT, LIGHTS["ambient"])
+    assert not jax.jit(relight.shade)(one_pixel(4), FRONT, LIGHTS["ambient"]).any()
 
 
 def test_errors_name_the_argument():
