@@ -6,6 +6,7 @@
 | a sun | `DirectionalLight(direction, color)` |
 | a lamp | `PointLight(position, color)` |
 | a lamp that shines into a cone | `SpotLight(position, direction, color, ...)` |
+| soft light from all around, without highlights | `SphericalHarmonicsLight(coefficients)` |
 """
 
 from typing import Any, ClassVar, final
@@ -18,7 +19,14 @@ from jaxtyping import Array, Float
 from jaxfx._checks import check, parameter
 
 
-__all__ = ["AmbientLight", "DirectionalLight", "Light", "PointLight", "SpotLight"]
+__all__ = [
+    "AmbientLight",
+    "DirectionalLight",
+    "Light",
+    "PointLight",
+    "SphericalHarmonicsLight",
+    "SpotLight",
+]
 
 
 def _vector(name: str, value: Any) -> Float[Array, "3"]:
@@ -188,4 +196,48 @@ class SpotLight(eqx.Module):
         )
 
 
-Light = AmbientLight | DirectionalLight | PointLight | SpotLight
+@final
+class SphericalHarmonicsLight(eqx.Module):
+    """Soft light from all around, as nine numbers for each channel.
+
+    A matt surface hardly tells it from the surroundings that it stands for, if no sun is in
+    them. It has no highlights; the image is linear in the coefficients.
+
+    **Arguments:** `coefficients`: 9 3, linear RGB: of the radiance that comes from each
+    direction, in world space, in terms of the real orthonormal spherical harmonics of that
+    direction, by degree and order: 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy.
+
+    **Raises:** `ValueError` for a wrong shape or a number that is not finite.
+
+    **Gradient:** exact.
+
+    **Example:** the same from everywhere, and somewhat more from above:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import SphericalHarmonicsLight
+    >>> same = jnp.zeros((9, 3)).at[0].set((4 * jnp.pi) ** 0.5)
+    >>> sky = SphericalHarmonicsLight(same.at[1].set(0.5))
+    >>> sky.coefficients.shape
+    (9, 3)
+
+    With c the coefficients, Y the functions and N the normal, a pixel is `diffuse * sum(A * c *
+    Y(N))`, A being 1, 2/3 and 1/4 of degrees 0, 1 and 2. Of a GGX surface, `diffuse` is less
+    what the highlight takes, averaged over all directions.
+
+    Radiance that changes sharply, a sun say, is not well told by nine numbers: the light then
+    is negative on the side away from it. Nothing is cut off there, so that all stays linear.
+
+    Source: Ramamoorthi & Hanrahan 2001; that GGX loses is our own.
+    """
+
+    SHAPES: ClassVar = {"coefficients": (9, 3)}
+
+    coefficients: Float[Array, "9 3"]
+
+    def __init__(self, coefficients: Any):
+        name = "SphericalHarmonicsLight(coefficients)"
+        self.coefficients = parameter(name, coefficients, (9, 3))
+        check(name, self.coefficients, np.isfinite, "finite")
+
+
+Light = AmbientLight | DirectionalLight | PointLight | SpotLight | SphericalHarmonicsLight

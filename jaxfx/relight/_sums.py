@@ -96,7 +96,7 @@ def _with_term(
     for index, term in terms.items():
         parts[index] = _add(parts[index], jnp.where(is_finite[..., None], sign * term, 0))
     nonfinite = sums.nonfinite + jnp.where(is_finite, 0, sign).astype(jnp.int32)
-    return Sums(*parts, nonfinite)
+    return Sums(parts[0], parts[1], parts[2], nonfinite)
 
 
 def _add(to: Sum, term: _Image) -> Sum:

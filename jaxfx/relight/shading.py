@@ -21,13 +21,21 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, is_concrete, share, shares
+from jaxfx._harmonics import irradiance as harmonic_irradiance
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
-from jaxfx.relight._ggx import lobe_and_fresnel
+from jaxfx.light import (
+    AmbientLight,
+    DirectionalLight,
+    Light,
+    PointLight,
+    SphericalHarmonicsLight,
+    SpotLight,
+)
+from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing
 
 
 _Vectors = Float[Array, "height width 3"]
@@ -61,7 +69,7 @@ def shade(
     **Arguments:**
 
     - `gbuffer`, `camera`: the cache, height width, and the camera that it was made with.
-    - `light`: any of the four.
+    - `light`: of any kind.
     - `visibility`: height width, in [0, 1] or booleans: the share of the light that arrives,
       from a filter of `jaxfx.shadow` for instance. Left out, all of it arrives.
 
@@ -95,6 +103,7 @@ def shade(
     image of L about N, H halfway between L and V, and n = 2 / roughness**2 - 2, a pixel is
 
     - `color * ambient` under ambient light, `color` being the light's;
+    - what `SphericalHarmonicsLight` states under one;
     - `E * diffuse * max(N.L, 0)` under any other, to which, where N.L > 0, Phong adds
       `E * specular * max(R.V, 0)**n` and Blinn `E * specular * max(N.H, 0)**n`.
 
@@ -257,15 +266,18 @@ def with_reflectances(
 
 
 def received(
-    surface: Surface, light: DirectionalLight | PointLight | SpotLight
-) -> tuple[_Vectors, _Vectors, _Vectors | None]:
+    surface: Surface,
+    light: DirectionalLight | PointLight | SpotLight | SphericalHarmonicsLight,
+) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
     """One light's diffuse, specular and grazing light, before the reflectances multiply it.
 
     For the diffuse one that is the irradiance; for the specular one irradiance times highlight.
-    Of GGX the two are less a share, which the grazing one has whatever the reflectance; None
-    stands for none, where no pixel is of GGX.
+    Of GGX the two are less a share, which the grazing one has whatever the reflectance. None
+    stands for no highlights, and for no pixel of GGX.
     """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
+    if isinstance(light, SphericalHarmonicsLight):
+        return _from_around(surface, light.coefficients), None, None
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
     cosine = _dot(surface.normal, to_light)
     halfway = _unit(to_light + surface.to_camera)
@@ -286,6 +298,16 @@ def received(
     specular = irradiance * jnp.where(is_ggx, lobe, highlight)[..., None]
     grazing = grazing[..., None]
     return (1 - grazing) * diffuse, (1 - grazing) * specular, grazing * specular
+
+
+def _from_around(surface: Surface, coefficients: Float[Array, "9 3"]) -> _Vectors:
+    """The diffuse light of a radiance with these coefficients; none where a normal is zero."""
+    diffuse = harmonic_irradiance(surface.normal, coefficients)
+    has_normal = _dot(surface.normal, surface.normal) != 0
+    if surface.facing is not None:
+        is_ggx = surface.shader == _GGX
+        diffuse *= jnp.where(is_ggx, 1 - mean_grazing(surface.facing), 1)[..., None]
+    return jnp.where(has_normal[..., None], diffuse, 0)
 
 
 def _direction_and_irradiance(
