@@ -38,6 +38,7 @@ from jaxfx.lens import FocusPlanes, Lens, ThinLens
 from jaxfx.light import (
     AmbientLight,
     DirectionalLight,
+    EnvironmentLight,
     Light,
     PointLight,
     SphericalHarmonicsLight,
@@ -52,6 +53,7 @@ __all__ = [
     "AmbientLight",
     "Camera",
     "DirectionalLight",
+    "EnvironmentLight",
     "FocusPlanes",
     "GBuffer",
     "Lens",

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 
 # Of each function the factor of its polynomial; they are orthonormal over the sphere.
-_FACTORS = np.sqrt(np.array([1, 3, 3, 3, 15, 15, 5 / 4, 15, 15 / 4]) / (4 * np.pi))
+FACTORS = np.sqrt(np.array([1, 3, 3, 3, 15, 15, 5 / 4, 15, 15 / 4]) / (4 * np.pi))
 # Of each function the share that is left of it in the light that falls onto a surface, when all
 # directions above the surface have their say by the cosine. Of a light that is the same
 # everywhere all is left: the unit is what a white Lambert surface shows of it.
@@ -29,7 +29,7 @@ def irradiance(
     x, y, z = (normal[..., k] for k in range(3))
     one = jnp.ones_like(x)
     functions = [one, y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y]
-    weights = coefficients * jnp.asarray(_FACTORS * _LEFT, normal.dtype)[:, None]
+    weights = coefficients * jnp.asarray(FACTORS * _LEFT, normal.dtype)[:, None]
     # Written out: XLA does not fuse across a product of matrices.
     terms = [
         function[..., None] * weights[k][None, None] for k, function in enumerate(functions)

@@ -99,6 +99,10 @@ def harmonics(rng, size):
     return jaxfx.SphericalHarmonicsLight(rng.normal(size=(9, 3)))
 
 
+def environment(rng, size):
+    return jaxfx.EnvironmentLight(rng.uniform(0.1, 1, (8, 16, 3)))
+
+
 def receivers(rng, size):
     """Points whose shadow-map pixels lie in the map, near it and behind the light."""
     u, v = (rng.uniform(-2, count + 2, size) for count in size[::-1])
@@ -164,7 +168,7 @@ EXAMPLES = {
     "camera": [pinhole, orthographic],
     "target": [pinhole, orthographic],
     "lens": [thin_lens, focus_planes],
-    "light": [point, ambient, directional, spot, harmonics],
+    "light": [point, ambient, directional, spot, harmonics, environment],
     "lights": [lambda rng, size: [make(rng, size) for make in (ambient, point)]],
     "gbuffers": [lambda rng, size: [gbuffer(rng, size), gbuffer(rng, size)]],
     "cameras": [lambda rng, size: [pinhole(rng, size), orthographic(rng, size)]],

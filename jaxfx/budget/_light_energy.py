@@ -63,7 +63,8 @@ def by_kind(lights: Sequence[Light], shadows: Sequence[Any]) -> list[list[int]]:
     """Indices of the lights of each kind, those with a shadow apart: each a program's loop."""
     kinds: dict[str, list[int]] = {}
     for index, (light, shadow) in enumerate(zip(lights, shadows, strict=True)):
-        kinds.setdefault(f"{type(light)} {shadow is None}", []).append(index)
+        rows = getattr(light, "heights", ())
+        kinds.setdefault(f"{type(light)} {rows} {shadow is None}", []).append(index)
     return [kinds[kind] for kind in sorted(kinds)]
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxfx._numerics import working_dtype
 from jaxfx.budget._light_energy import Energy
 from jaxfx.budget._search import Search
-from jaxfx.light import Light, SphericalHarmonicsLight
+from jaxfx.light import EnvironmentLight, Light, SphericalHarmonicsLight
 from jaxfx.relight.shading import render
 
 
@@ -51,7 +51,8 @@ def try_merging(search: Search, brought: Energy, lights: Sequence[Light]) -> Non
     # The groups after no pair was joined, after one, after two, ...
     groups = [tuple(places)]
     # Light from all around has no place to be moved to.
-    alone = (i for i, light in enumerate(lights) if isinstance(light, SphericalHarmonicsLight))
+    around = SphericalHarmonicsLight | EnvironmentLight
+    alone = (i for i, light in enumerate(lights) if isinstance(light, around))
     apart = (*shadowed, *alone)
     while pair := nearest(places, apart):
         first, second = (places.pop(group) for group in pair)

@@ -19,7 +19,7 @@ from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.light import Light, SphericalHarmonicsLight, SpotLight
+from jaxfx.light import EnvironmentLight, Light, SphericalHarmonicsLight, SpotLight
 from jaxfx.relight import shade
 
 
@@ -100,6 +100,9 @@ def with_values(light: Any, values: Values) -> Any:
     if isinstance(light, SphericalHarmonicsLight):
         color = values.get("color", light.coefficients)
         return SphericalHarmonicsLight(color.reshape(light.coefficients.shape))
+    if isinstance(light, EnvironmentLight):  # Of which only the color is free.
+        color = values.get("color", light.color)
+        return eqx.tree_at(lambda light: light.color, light, color)
     fields = {name: getattr(light, name) for name in vars(light)} | values
     if "direction" in values:
         fields["direction"] = _turned(light.direction, values["direction"])

@@ -134,7 +134,7 @@ def _colored(lights: Sequence[Any], colors: np.ndarray) -> list[Any]:
     for light in lights:
         count, _ = color_shape(light)
         own, rest = rest[:count].reshape(-1), rest[count:]
-        field = "coefficients" if count > 1 else "color"
+        field = "color" if count == 1 else "coefficients"
         select = lambda light, field=field: getattr(light, field)
         colored.append(eqx.tree_at(select, light, own.reshape(select(light).shape)))
     return colored

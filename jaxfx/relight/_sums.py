@@ -6,13 +6,13 @@ are equal to the last bit.
 """
 
 import functools
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx.light import AmbientLight, Light
+from jaxfx.light import AmbientLight, Light, alike
 from jaxfx.relight.shading import (
     Surface,
     received,
@@ -62,9 +62,8 @@ def with_lights(surface, sums, lights, visibilities, signs):
 
     One loop for each kind of light; ambient lights have no term.
     """
-    for kind in get_args(Light):
-        which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
-        if not which or kind is AmbientLight:
+    for which in alike(lights):
+        if isinstance(lights[which[0]], AmbientLight):
             continue
         group = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lights[i] for i in which))
         shadows = stack_visibilities([visibilities[i] for i in which], surface)

@@ -11,13 +11,14 @@ that sharp highlights and narrow cones lose no digits and no cosine exceeds 1.
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfx import _environment
 from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, is_concrete, share, shares
@@ -30,12 +31,14 @@ from jaxfx.gbuffer import GBuffer
 from jaxfx.light import (
     AmbientLight,
     DirectionalLight,
+    EnvironmentLight,
     Light,
     PointLight,
     SphericalHarmonicsLight,
     SpotLight,
+    alike,
 )
-from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing
+from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing, mean_lobe, roughness_squared
 
 
 _Vectors = Float[Array, "height width 3"]
@@ -103,7 +106,7 @@ def shade(
     image of L about N, H halfway between L and V, and n = 2 / roughness**2 - 2, a pixel is
 
     - `color * ambient` under ambient light, `color` being the light's;
-    - what `SphericalHarmonicsLight` states under one;
+    - what `SphericalHarmonicsLight` and `EnvironmentLight` state under one;
     - `E * diffuse * max(N.L, 0)` under any other, to which, where N.L > 0, Phong adds
       `E * specular * max(R.V, 0)**n` and Blinn `E * specular * max(N.H, 0)**n`.
 
@@ -267,7 +270,11 @@ def with_reflectances(
 
 def received(
     surface: Surface,
-    light: DirectionalLight | PointLight | SpotLight | SphericalHarmonicsLight,
+    light: DirectionalLight
+    | PointLight
+    | SpotLight
+    | SphericalHarmonicsLight
+    | EnvironmentLight,
 ) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
     """One light's diffuse, specular and grazing light, before the reflectances multiply it.
 
@@ -277,7 +284,9 @@ def received(
     """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
     if isinstance(light, SphericalHarmonicsLight):
-        return _from_around(surface, light.coefficients), None, None
+        return _from_around(surface, surface.normal, light.coefficients), None, None
+    if isinstance(light, EnvironmentLight):
+        return _from_picture(surface, light)
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
     cosine = _dot(surface.normal, to_light)
     halfway = _unit(to_light + surface.to_camera)
@@ -300,14 +309,41 @@ def received(
     return (1 - grazing) * diffuse, (1 - grazing) * specular, grazing * specular
 
 
-def _from_around(surface: Surface, coefficients: Float[Array, "9 3"]) -> _Vectors:
-    """The diffuse light of a radiance with these coefficients; none where a normal is zero."""
-    diffuse = harmonic_irradiance(surface.normal, coefficients)
+def _from_around(
+    surface: Surface, normal: _Vectors, coefficients: Float[Array, "9 3"]
+) -> _Vectors:
+    """The diffuse light of a radiance with these coefficients; none where a normal is zero.
+
+    `normal` is in the axes of the coefficients.
+    """
+    diffuse = harmonic_irradiance(normal, coefficients)
     has_normal = _dot(surface.normal, surface.normal) != 0
     if surface.facing is not None:
         is_ggx = surface.shader == _GGX
         diffuse *= jnp.where(is_ggx, 1 - mean_grazing(surface.facing), 1)[..., None]
     return jnp.where(has_normal[..., None], diffuse, 0)
+
+
+def _from_picture(
+    surface: Surface, light: EnvironmentLight
+) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
+    """The three parts of the light of a picture of all directions."""
+    column = lambda k: jnp.broadcast_to(light.rotation[:, k], surface.normal.shape)
+    turned = lambda way: jnp.stack([_dot(way, column(k)) for k in range(3)], axis=-1)
+    color = light.color[None, None]
+    diffuse = color * _from_around(surface, turned(surface.normal), light.coefficients)
+    if surface.facing is None:
+        return diffuse, None, None
+    mirrored = 2 * surface.facing[..., None] * surface.normal - surface.to_camera
+    lobe = mean_lobe(surface.facing, jnp.sqrt(roughness_squared(surface.exponent)))
+    toward = surface.normal + lobe.mirrored[..., None] * (mirrored - surface.normal)
+    picture = _environment.look_up(light.pyramid, light.heights, turned(toward), lobe.roughness)
+    is_ggx = (surface.shader == _GGX) & (_dot(surface.normal, surface.normal) != 0)
+    specular, grazing = (
+        jnp.where(is_ggx[..., None], color * picture * mean[..., None], 0)
+        for mean in (lobe.specular, lobe.grazing)
+    )
+    return diffuse, specular, grazing
 
 
 def _direction_and_irradiance(
@@ -415,13 +451,11 @@ def _render(gbuffer, camera, lights, visibilities, with_ggx):
     surface = to_surface(gbuffer, camera, with_ggx)
     image = jnp.zeros_like(surface.position)
     stack = lambda *leaves: jnp.stack([leaf.astype(image.dtype) for leaf in leaves])
-    for kind in get_args(Light):
-        which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
-        if which:
-            group = jax.tree.map(stack, *(lights[i] for i in which))
-            shadows = stack_visibilities([visibilities[i] for i in which], surface)
-            terms = surface, image, (group, shadows)
-            image = by_platform(*terms, cpu=_one_by_one, accelerator=_together)
+    for which in alike(lights):
+        group = jax.tree.map(stack, *(lights[i] for i in which))
+        shadows = stack_visibilities([visibilities[i] for i in which], surface)
+        terms = surface, image, (group, shadows)
+        image = by_platform(*terms, cpu=_one_by_one, accelerator=_together)
     return image.astype(gbuffer.color.dtype)
 
 

@@ -14,6 +14,7 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.light import (
     AmbientLight,
     DirectionalLight,
+    EnvironmentLight,
     Light,
     SphericalHarmonicsLight,
     SpotLight,
@@ -96,7 +97,7 @@ def light_cameras(
         "positive",
     )
     inner = map_size - 2 * margin
-    if isinstance(light, AmbientLight | SphericalHarmonicsLight):
+    if isinstance(light, AmbientLight | SphericalHarmonicsLight | EnvironmentLight):
         return ()
     if isinstance(light, DirectionalLight):
         forward = normalize(light.direction)
