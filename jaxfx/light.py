@@ -10,8 +10,7 @@
 | the surroundings, from a picture of all directions | `EnvironmentLight(image, rotation)` |
 """
 
-from collections.abc import Sequence
-from typing import Any, ClassVar, final, get_args
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -346,12 +345,3 @@ Light = (
     | SphericalHarmonicsLight
     | EnvironmentLight
 )
-
-
-def alike(lights: Sequence[Light]) -> list[list[int]]:
-    """The indices of lights that can be stacked: of one kind, with as many numbers."""
-    kinds, groups = get_args(Light), {}
-    for index, light in enumerate(lights):
-        key = kinds.index(type(light)), getattr(light, "heights", ())
-        groups.setdefault(key, []).append(index)
-    return [groups[key] for key in sorted(groups)]

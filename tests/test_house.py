@@ -26,6 +26,7 @@ NUMERICS = {
         "_arrays",
         "_checks",
         "_choice",
+        "_environment",
         "_extras",
         "_filter",
         "_harmonics",

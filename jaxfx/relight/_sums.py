@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx.light import AmbientLight, Light, alike
+from jaxfx._arguments import alike
+from jaxfx.light import AmbientLight, Light
 from jaxfx.relight.shading import (
     Surface,
     received,

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx import _environment
-from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
+from jaxfx._arguments import alike, check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, is_concrete, share, shares
 from jaxfx._harmonics import irradiance as harmonic_irradiance
@@ -36,7 +36,6 @@ from jaxfx.light import (
     PointLight,
     SphericalHarmonicsLight,
     SpotLight,
-    alike,
 )
 from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing, mean_lobe, roughness_squared
 

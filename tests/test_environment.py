@@ -17,7 +17,7 @@ from jaxfx import (
 )
 from jaxfx.relight._ggx import mean_lobe
 from tests.relight.test_ggx import furnace
-from tests.relight.test_harmonics import functions
+from tests.test_harmonics import functions
 
 
 SIZE = 12
