@@ -407,7 +407,8 @@ def test_an_unknown_shader_is_named_or_black():
 def test_errors_name_the_argument():
     shade, render = inspect.unwrap(relight.shade), inspect.unwrap(relight.render)
     gbuffer, camera, light = make_gbuffer(0), make_camera("pinhole", 7, 9), LIGHTS["point"]
-    kinds = "AmbientLight, DirectionalLight, PointLight, SpotLight"
+    kinds = "AmbientLight, DirectionalLight, PointLight, SpotLight, SphericalHarmonicsLight, "
+    kinds += "EnvironmentLight"
     for visibility in (np.ones((9, 7)), np.ones((7, 9, 1)), 1.0):
         with pytest.raises(ValueError, match=r"`shade\(visibility\)` must have shape \(7, 9\)"):
             shade(gbuffer, camera, light, visibility)
