@@ -13,6 +13,7 @@ from jaxfx import (
     GBuffer,
     OrthographicCamera,
     PointLight,
+    fit,
     relight,
 )
 from jaxfx.relight._ggx import mean_lobe
@@ -280,3 +281,15 @@ def test_errors_name_the_argument():
         make(good, np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match=r"`turned\(rotation\)` must be a rotation"):
         make(good).turned(2 * np.eye(3))
+
+
+@pytest.mark.full
+def test_a_fit_finds_its_color():
+    gbuffer, _, _ = ball(1.0, 0.4)
+    picture = clouds(directions(16)[0])
+    photograph = relight.shade(
+        gbuffer, CAMERA, EnvironmentLight(picture, TURN, [2.0, 1.5, 0.5])
+    )
+    start = [EnvironmentLight(picture, TURN)]
+    fitted = fit.lights(photograph, gbuffer, CAMERA, start, loss="squares")
+    np.testing.assert_allclose(fitted.lights[0].color, [2.0, 1.5, 0.5], rtol=1e-6)
