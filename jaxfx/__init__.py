@@ -35,7 +35,15 @@ from typing import Any
 from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.lens import FocusPlanes, Lens, ThinLens
-from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
+from jaxfx.light import (
+    AmbientLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+    SphericalHarmonicsLight,
+    SpotLight,
+)
 from jaxfx.transfer import Transfer
 
 
@@ -45,6 +53,7 @@ __all__ = [
     "AmbientLight",
     "Camera",
     "DirectionalLight",
+    "EnvironmentLight",
     "FocusPlanes",
     "GBuffer",
     "Lens",
@@ -52,6 +61,7 @@ __all__ = [
     "OrthographicCamera",
     "PinholeCamera",
     "PointLight",
+    "SphericalHarmonicsLight",
     "SpotLight",
     "ThinLens",
     "Transfer",

@@ -4,6 +4,7 @@ A camera, lens or light whose fields have a leading axis is a batch. Without `ja
 fields would be broadcast against an image's rows and columns, and no error raised.
 """
 
+from collections.abc import Sequence
 from typing import Any, get_args
 
 import jax
@@ -57,3 +58,12 @@ def check_gbuffer(name: str, gbuffer: Any) -> GBuffer:
     if not isinstance(gbuffer, GBuffer):
         raise ValueError(f"`{name}` must be a GBuffer, got {type(gbuffer).__name__}.")
     return GBuffer(*jax.tree.leaves(gbuffer))
+
+
+def alike(lights: Sequence[Light]) -> list[list[int]]:
+    """The indices of lights that can be stacked: of one kind, with as many numbers."""
+    kinds, groups = get_args(Light), {}
+    for index, light in enumerate(lights):
+        key = kinds.index(type(light)), getattr(light, "heights", ())
+        groups.setdefault(key, []).append(index)
+    return [groups[key] for key in sorted(groups)]

@@ -11,6 +11,9 @@ from jaxfx._checks import as_array, parameter, share
 
 __all__ = ["GBuffer"]
 
+# Reflectance at normal incidence of a dielectric of refractive index 1.5, as glTF 2.0 has it.
+DIELECTRIC = 0.04
+
 
 @final
 class GBuffer(eqx.Module):
@@ -22,9 +25,11 @@ class GBuffer(eqx.Module):
     **Arguments:** images of one height and width.
 
     - `color`: height width 3, base colour of the surface, linear RGB.
-    - `shader`: height width, integers: -1 nothing, 0 Lambert, 1 Phong, 2 Blinn.
+    - `shader`: height width, integers: -1 nothing, 0 Lambert, 1 Phong, 2 Blinn, 3 GGX (glTF's
+      metallic-roughness: `GBuffer.metallic_roughness` makes one).
     - `ambient`, `diffuse`, `specular`: height width 3, the linear RGB reflectances that
-      ambient, diffuse and specular light are multiplied by (they include the base colour).
+      ambient, diffuse and specular light are multiplied by (they include the base colour). Of
+      GGX, `specular` is the reflectance straight on.
     - `normal`: height width 3, unit vectors in world space, zero where there is nothing.
     - `depth`: height width, scene units along the optical axis, inf where there is nothing.
     - `roughness`: height width, in [0, 1].
@@ -85,3 +90,60 @@ class GBuffer(eqx.Module):
         self.normal = parameter("GBuffer(normal)", normal, shape)
         self.depth = parameter("GBuffer(depth)", depth, shape[:2])
         self.roughness = share("GBuffer(roughness)", roughness, shape[:2])
+
+    @classmethod
+    def metallic_roughness(
+        cls, color: Any, metallic: Any, roughness: Any, normal: Any, depth: Any
+    ) -> "GBuffer":
+        """A cache of glTF's metallic-roughness material, which `relight` shades by GGX.
+
+        Its eight images are the usual ones, so that a file or a painting tool needs no ninth.
+
+        **Arguments:** images of one height and width.
+
+        - `color`: height width 3, base colour, linear RGB.
+        - `metallic`: height width, in [0, 1]: 1 a metal, 0 a dielectric of index 1.5.
+        - `roughness`, `normal`, `depth`: as in `GBuffer`. Where the depth is missing or inf,
+          the shader is -1.
+
+        **Returns:** the `GBuffer`: `ambient` is `color`, `diffuse` is `color * (1 - metallic)`,
+        `specular` mixes 0.04 and `color` by `metallic`.
+
+        **Raises:** `ValueError` for a wrong shape, or a metallic or roughness outside [0, 1].
+        Traced values are not checked.
+
+        **Gradient:** exact with respect to every image.
+
+        **Example:** a wall of rough gold:
+
+        >>> import jax.numpy as jnp
+        >>> from jaxfx import GBuffer
+        >>> gold = jnp.broadcast_to(jnp.array([1.0, 0.75, 0.25]), (8, 8, 3))
+        >>> one, facing = jnp.ones((8, 8)), jnp.zeros((8, 8, 3)).at[..., 2].set(-1)
+        >>> wall = GBuffer.metallic_roughness(gold, one, one / 2, facing, 3 * one)
+        >>> print(wall.specular[4, 4], wall.diffuse[4, 4], wall.shader[4, 4])
+        [1.   0.75 0.25] [0. 0. 0.] 3
+
+        Source: glTF 2.0 (Khronos 2017), 3.9.2 and appendix B.
+        """
+        name = "GBuffer.metallic_roughness"
+        color = parameter(f"{name}(color)", color, None)
+        if color.ndim != 3 or color.shape[2] != 3:
+            raise ValueError(
+                f"`{name}(color)` must have shape (height, width, 3), got {color.shape}."
+            )
+        depth = parameter(f"{name}(depth)", depth, color.shape[:2])
+        metal = share(f"{name}(metallic)", metallic, color.shape[:2])
+        roughness = share(f"{name}(roughness)", roughness, color.shape[:2])
+        metal = metal.astype(color.dtype)[..., None]
+        is_surface = (depth > 0) & (depth < jnp.inf)
+        return cls(
+            color=color,
+            shader=jnp.where(is_surface, 3, -1).astype(jnp.int32),
+            ambient=color,
+            diffuse=color * (1 - metal),
+            specular=DIELECTRIC * (1 - metal) + color * metal,
+            normal=normal,
+            depth=depth,
+            roughness=roughness,
+        )

@@ -6,19 +6,32 @@
 | a sun | `DirectionalLight(direction, color)` |
 | a lamp | `PointLight(position, color)` |
 | a lamp that shines into a cone | `SpotLight(position, direction, color, ...)` |
+| soft light from all around, without highlights | `SphericalHarmonicsLight(coefficients)` |
+| the surroundings, from a picture of all directions | `EnvironmentLight(image, rotation)` |
 """
 
 from typing import Any, ClassVar, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfx import _environment
 from jaxfx._checks import check, parameter
+from jaxfx._numerics import working_dtype
 
 
-__all__ = ["AmbientLight", "DirectionalLight", "Light", "PointLight", "SpotLight"]
+__all__ = [
+    "AmbientLight",
+    "DirectionalLight",
+    "EnvironmentLight",
+    "Light",
+    "PointLight",
+    "SphericalHarmonicsLight",
+    "SpotLight",
+]
 
 
 def _vector(name: str, value: Any) -> Float[Array, "3"]:
@@ -188,4 +201,147 @@ class SpotLight(eqx.Module):
         )
 
 
-Light = AmbientLight | DirectionalLight | PointLight | SpotLight
+@final
+class SphericalHarmonicsLight(eqx.Module):
+    """Soft light from all around, as nine numbers for each channel.
+
+    A matt surface hardly tells it from the surroundings that it stands for, if no sun is in
+    them. It has no highlights; the image is linear in the coefficients.
+
+    **Arguments:** `coefficients`: 9 3, linear RGB: of the radiance that comes from each
+    direction, in world space, in terms of the real orthonormal spherical harmonics of that
+    direction, by degree and order: 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy.
+
+    **Raises:** `ValueError` for a wrong shape or a number that is not finite.
+
+    **Gradient:** exact.
+
+    **Example:** the same from everywhere, and somewhat more from above:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxfx import SphericalHarmonicsLight
+    >>> same = jnp.zeros((9, 3)).at[0].set((4 * jnp.pi) ** 0.5)
+    >>> sky = SphericalHarmonicsLight(same.at[1].set(0.5))
+    >>> sky.coefficients.shape
+    (9, 3)
+
+    With c the coefficients, Y the functions and N the normal, a pixel is `diffuse * sum(A * c *
+    Y(N))`, A being 1, 2/3 and 1/4 of degrees 0, 1 and 2. Of a GGX surface, `diffuse` is less
+    what the highlight takes, averaged over all directions.
+
+    Radiance that changes sharply, a sun say, is not well told by nine numbers: the light then
+    is negative on the side away from it. Nothing is cut off there, so that all stays linear.
+
+    Source: Ramamoorthi & Hanrahan 2001; that GGX loses is our own.
+    """
+
+    SHAPES: ClassVar = {"coefficients": (9, 3)}
+
+    coefficients: Float[Array, "9 3"]
+
+    def __init__(self, coefficients: Any):
+        name = "SphericalHarmonicsLight(coefficients)"
+        self.coefficients = parameter(name, coefficients, (9, 3))
+        check(name, self.coefficients, np.isfinite, "finite")
+
+
+@final
+class EnvironmentLight(eqx.Module):
+    """The surroundings, from a picture of all directions: a sky, a room, a panorama.
+
+    Matt surfaces get nine spherical harmonics of it, GGX surfaces highlights from blurs of it
+    as well. Both are made once, here: to turn the surroundings (`turned`) costs nothing.
+
+    **Arguments:**
+
+    - `image`: height width 3, twice as wide as high, linear RGB radiance: the picture is
+      equirectangular, row 0 is straight up. Of the picture's axes y is up, the middle column
+      looks along -z, the right half lies at +x.
+    - `rotation`: 3 3, from the picture's axes to the world's; None where they are the same, as
+      for a mesh file with y up.
+    - `color`: 3, which multiplies the picture.
+
+    **Raises:** `ValueError` for another shape, a radiance that is negative, NaN or inf, or a
+    `rotation` that is none to 1e-3.
+
+    **Gradient:** exact, through both approximations, with respect to `image`, `rotation` and
+    `color`. It jumps where a mirrored direction passes from texel to texel.
+
+    **Example:** bright above, dark below:
+
+    >>> import numpy as np
+    >>> from jaxfx import EnvironmentLight
+    >>> sky = np.ones((16, 32, 3)) * np.linspace(1, 0, 16)[:, None, None]
+    >>> light = EnvironmentLight(sky)
+    >>> light.coefficients.shape, light.heights[:2]
+    ((9, 3), (16, 16))
+
+    - `coefficients`: 9 3, as in `SphericalHarmonicsLight`, in the picture's axes.
+    - `pyramid`, `heights`: the texels of all blurs, and how many rows each has.
+
+    The split sum takes a highlight for round, and as seen straight on: at grazing angles a true
+    one is drawn out. Lambert, Phong and Blinn surfaces get diffuse light alone. Shadows are
+    given, as any light's: one number for all directions.
+
+    Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001.
+    """
+
+    SHAPES: ClassVar = {"color": (3,), "rotation": (3, 3), "coefficients": (9, 3)}
+
+    color: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    coefficients: Float[Array, "9 3"]
+    pyramid: Float[Array, "texel 3"]
+    heights: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, image: Any, rotation: Any = None, color: Any = (1.0, 1.0, 1.0)):
+        image = parameter("EnvironmentLight(image)", image, None)
+        height = image.shape[0] if image.ndim == 3 else 0
+        if height == 0 or image.shape != (height, 2 * height, 3):
+            raise ValueError(
+                "`EnvironmentLight(image)` must have shape (height, 2 * height, 3), "
+                f"got {image.shape}."
+            )
+        is_radiance = lambda v: np.isfinite(v) & (v >= 0)
+        check("EnvironmentLight(image)", image, is_radiance, "finite, 0 or positive")
+        image = image.astype(working_dtype(image.dtype))
+        self.color = _color("EnvironmentLight(color)", color)
+        rotation = np.eye(3) if rotation is None else rotation
+        self.rotation = _rotation("EnvironmentLight(rotation)", rotation)
+        self.heights = _environment.heights(height)
+        self.coefficients = jax.jit(_environment.coefficients)(image)
+        self.pyramid = jax.jit(_environment.blurs)(image)
+
+    def turned(self, rotation: Any) -> "EnvironmentLight":
+        """The same surroundings, turned otherwise; nothing is blurred again.
+
+        **Arguments:** `rotation`: 3 3, from the picture's axes to the world's.
+
+        **Returns:** the new `EnvironmentLight`.
+
+        **Raises:** `ValueError` for another shape, or what is no rotation to 1e-3.
+
+        **Gradient:** exact.
+        """
+        rotation = _rotation("turned(rotation)", rotation)
+        return eqx.tree_at(lambda light: light.rotation, self, rotation)
+
+
+def _rotation(name: str, value: Any) -> Float[Array, "3 3"]:
+    """A matrix that turns; `ValueError` otherwise."""
+    rotation = parameter(name, value, (3, 3))
+    is_turn = lambda v: (
+        np.allclose(v @ v.T, np.eye(3), atol=1e-3) and np.linalg.det(v.astype(float)) > 0
+    )
+    check(name, rotation, is_turn, "a rotation")
+    return rotation
+
+
+Light = (
+    AmbientLight
+    | DirectionalLight
+    | PointLight
+    | SpotLight
+    | SphericalHarmonicsLight
+    | EnvironmentLight
+)

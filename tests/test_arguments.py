@@ -19,11 +19,13 @@ import jaxfx
 from jaxfx import (
     AmbientLight,
     DirectionalLight,
+    EnvironmentLight,
     FocusPlanes,
     GBuffer,
     OrthographicCamera,
     PinholeCamera,
     PointLight,
+    SphericalHarmonicsLight,
     SpotLight,
     ThinLens,
     Transfer,
@@ -321,6 +323,11 @@ CALLS = {
     ),
     "AmbientLight": (AmbientLight, {"color": np.ones(3)}),
     "DirectionalLight": (DirectionalLight, {"direction": np.ones(3), "color": np.ones(3)}),
+    "SphericalHarmonicsLight": (SphericalHarmonicsLight, {"coefficients": np.ones((9, 3))}),
+    "EnvironmentLight": (
+        EnvironmentLight,
+        {"image": np.ones((4, 8, 3)), "rotation": np.eye(3), "color": np.ones(3)},
+    ),
     "PointLight": (PointLight, {"position": np.ones(3), "color": np.ones(3)}),
     "SpotLight": (
         SpotLight,
@@ -371,6 +378,7 @@ WRONG = {
 }
 # Left out, these are something else.
 MAY_BE_NONE = {
+    "rotation",
     *(
         "bias",
         "slope_bias",

@@ -22,7 +22,18 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 # The floors, low to high. A module may import its own floor and those below it; an effect may
 # not import another effect; only the topmost floor may import the host side.
 NUMERICS = {
-    *("_arrays", "_checks", "_choice", "_extras", "_filter", "_holes", "_linear", "_numerics"),
+    *(
+        "_arrays",
+        "_checks",
+        "_choice",
+        "_environment",
+        "_extras",
+        "_filter",
+        "_harmonics",
+        "_holes",
+        "_linear",
+        "_numerics",
+    ),
     "_platform",
     "_xla",
     *("_loops", "_meshes", "_progress", "_pyramid", "_sampling", "_tiles"),

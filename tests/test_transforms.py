@@ -95,6 +95,14 @@ def spot(rng, size):
     return jaxfx.SpotLight([0.5, -1.0, 0.2], [-0.1, 0.3, 1.0], color, 0.3, 0.9)
 
 
+def harmonics(rng, size):
+    return jaxfx.SphericalHarmonicsLight(rng.normal(size=(9, 3)))
+
+
+def environment(rng, size):
+    return jaxfx.EnvironmentLight(rng.uniform(0.1, 1, (8, 16, 3)))
+
+
 def receivers(rng, size):
     """Points whose shadow-map pixels lie in the map, near it and behind the light."""
     u, v = (rng.uniform(-2, count + 2, size) for count in size[::-1])
@@ -106,7 +114,7 @@ def gbuffer(rng, size):
     normal = np.concatenate([rng.uniform(-0.4, 0.4, (*size, 2)), -np.ones((*size, 1))], axis=-1)
     return jaxfx.GBuffer(
         color=rng.uniform(0.1, 1, (*size, 3)),
-        shader=rng.integers(-1, 3, size),
+        shader=rng.integers(-1, 4, size),
         ambient=rng.uniform(0.1, 1, (*size, 3)),
         diffuse=rng.uniform(0.1, 1, (*size, 3)),
         specular=rng.uniform(0.1, 1, (*size, 3)),
@@ -160,7 +168,7 @@ EXAMPLES = {
     "camera": [pinhole, orthographic],
     "target": [pinhole, orthographic],
     "lens": [thin_lens, focus_planes],
-    "light": [point, ambient, directional, spot],
+    "light": [point, ambient, directional, spot, harmonics, environment],
     "lights": [lambda rng, size: [make(rng, size) for make in (ambient, point)]],
     "gbuffers": [lambda rng, size: [gbuffer(rng, size), gbuffer(rng, size)]],
     "cameras": [lambda rng, size: [pinhole(rng, size), orthographic(rng, size)]],

@@ -1,6 +1,7 @@
 """What each light brings to each tile of an image alone, and what its shadow takes away."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ from jaxtyping import Float
 
 from jaxfx.budget._tiles import tile_of, tile_sums
 from jaxfx.light import Light
-from jaxfx.relight.shading import Surface, reflected, to_surface
+from jaxfx.relight.shading import Surface, has_ggx, reflected, to_surface
 
 
 # The share of the error that left-out shadows may take, a ratio: the rest is for lights. A
@@ -50,7 +51,7 @@ def light_energy(gbuffer: Any, camera: Any, lights: Any, visibilities: Any) -> E
     shadows = {}
     for members in by_kind(lights, visibilities):
         some = [(lights[n], visibilities[n]) for n in members]
-        squares = np.asarray(_squares(gbuffer, camera, some), float)
+        squares = np.asarray(_squares(gbuffer, camera, some, has_ggx(gbuffer)), float)
         unshadowed[:, members], energy[:, members] = squares[0].T, squares[1].T
         if visibilities[members[0]] is not None:
             taken = np.sqrt(squares[2].sum(axis=1) / size)
@@ -62,7 +63,8 @@ def by_kind(lights: Sequence[Light], shadows: Sequence[Any]) -> list[list[int]]:
     """Indices of the lights of each kind, those with a shadow apart: each a program's loop."""
     kinds: dict[str, list[int]] = {}
     for index, (light, shadow) in enumerate(zip(lights, shadows, strict=True)):
-        kinds.setdefault(f"{type(light)} {shadow is None}", []).append(index)
+        rows = getattr(light, "heights", ())
+        kinds.setdefault(f"{type(light)} {rows} {shadow is None}", []).append(index)
     return [kinds[kind] for kind in sorted(kinds)]
 
 
@@ -78,10 +80,10 @@ def stacked(some: Sequence[Any], surface: Surface) -> tuple[Any, Any]:
     return lights, jnp.where((surface.shader < 0)[None], 0, shadows)
 
 
-@jax.jit
-def _squares(gbuffer, camera, some):
+@partial(jax.jit, static_argnames="with_ggx")
+def _squares(gbuffer, camera, some, with_ggx):
     """Sums of squares, light tile: without its shadow, with it, and of what that takes."""
-    surface = to_surface(gbuffer, camera)
+    surface = to_surface(gbuffer, camera, with_ggx)
 
     def each(both):
         light, shadow = both

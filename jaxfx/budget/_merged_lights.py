@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxfx._numerics import working_dtype
 from jaxfx.budget._light_energy import Energy
 from jaxfx.budget._search import Search
-from jaxfx.light import Light
+from jaxfx.light import EnvironmentLight, Light, SphericalHarmonicsLight
 from jaxfx.relight.shading import render
 
 
@@ -50,7 +50,11 @@ def try_merging(search: Search, brought: Energy, lights: Sequence[Light]) -> Non
     places = {(index,): Place.of(light, reach) for index, light in enumerate(lights)}
     # The groups after no pair was joined, after one, after two, ...
     groups = [tuple(places)]
-    while pair := nearest(places, shadowed):
+    # Light from all around has no place to be moved to.
+    around = SphericalHarmonicsLight | EnvironmentLight
+    alone = (i for i, light in enumerate(lights) if isinstance(light, around))
+    apart = (*shadowed, *alone)
+    while pair := nearest(places, apart):
         first, second = (places.pop(group) for group in pair)
         places[tuple(sorted(pair[0] + pair[1]))] = first.joined(second)
         groups.append(tuple(sorted(places)))
@@ -84,7 +88,9 @@ class Place(NamedTuple):
         position, direction, *angles = fields
         turns = [direction / max(np.linalg.norm(direction), _TINY), *angles]
         where = np.concatenate([position, *(reach * turn for turn in turns)])
-        return cls(type(light).__name__, where, float(jnp.abs(light.color).sum()))
+        is_around = isinstance(light, SphericalHarmonicsLight)
+        color = light.coefficients if is_around else light.color
+        return cls(type(light).__name__, where, float(jnp.abs(color).sum()))
 
     def joined(self, other: "Place") -> "Place":
         """Both as one, in their mean place by brightness."""
@@ -97,7 +103,7 @@ def nearest(groups: dict[tuple[int, ...], Place], apart: Sequence[int]) -> Any:
     """The two groups of one kind that lose least by joining; None if there are none.
 
     They lose the squared distances to their mean place, each times its brightness. Lights whose
-    index is in `apart`, those with shadows, stay alone.
+    index is in `apart` stay alone.
     """
     keys = [group for group in groups if group[0] not in apart]
     kind = np.array([groups[key].kind for key in keys])

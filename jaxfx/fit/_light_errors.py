@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx.fit._jackknife import covariance, independent_errors, tiles
-from jaxfx.fit._light_model import Model, mean_point, with_values
+from jaxfx.fit._light_model import Model, color_shape, mean_point, with_values
 from jaxfx.fit._robust import CUT, flatness, lengths
-from jaxfx.light import Light
+from jaxfx.light import Light, SphericalHarmonicsLight
 
 
 # Columns of the Jacobian, each of length 1, are dependent where a combination of length 1 of
@@ -151,26 +151,30 @@ def _untold(
     model: Model,
     lights: tuple[Light, ...],
     errors: Errors,
-    basis: Float[Array, "light height width 3"],
+    basis: Float[Array, "color height width 3"],
     reference: Float[Array, "height width 3"],
     base_weight: Float[Array, "height width"],
 ) -> tuple[tuple[int, str], ...]:
     """The parameters that are not determined, as the index of their light and their name.
 
-    `basis` is what each light adds to the image if it is white.
+    `basis` is what each color adds to the image if it is white.
     """
     whole, names = brightness(reference, base_weight), []
     fields: tuple[Any, ...] = lights
-    for index, (light, own, white) in enumerate(zip(fields, errors, basis, strict=True)):
-        lit = base_weight * jnp.sum(white, axis=-1)
-        for name, error in own.items():
-            size = 1.0
+    for index, (light, errors_of) in enumerate(zip(fields, errors, strict=True)):
+        count, _ = color_shape(light)
+        white, basis = basis[:count], basis[count:]
+        lit = base_weight * jnp.sum(white[0], axis=-1)
+        for name, error in errors_of.items():
+            size, own = 1.0, error
             if name == "color":
-                size = whole / brightness(white, base_weight)
+                each = jnp.stack([brightness(image, base_weight) for image in white])
+                size = whole * count**0.5
+                own = error.reshape(count, 3) * each[:, None]
             elif name == "position":
                 lit_point = mean_point(model.gbuffer, model.camera, lit)
                 size = jnp.linalg.norm(light.position - lit_point)
-            if not jnp.linalg.norm(error) <= _MOST_ERROR * size:
+            if not jnp.linalg.norm(own) <= _MOST_ERROR * size:
                 names.append((index, name))
     return tuple(names)
 
@@ -188,6 +192,8 @@ def _by_light(
         by_light.append({})
         for name, value in model.values(light).items():
             own, rest = jnp.stack(rest[: len(value)]), rest[len(value) :]
+            if name == "color" and isinstance(light, SphericalHarmonicsLight):
+                own = own.reshape(light.coefficients.shape)
             by_light[-1][name] = jnp.sqrt(jnp.sum(own**2)) if name == "direction" else own
     return tuple(by_light)
 

@@ -19,7 +19,7 @@ from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.light import Light, SpotLight
+from jaxfx.light import EnvironmentLight, Light, SphericalHarmonicsLight, SpotLight
 from jaxfx.relight import shade
 
 
@@ -37,8 +37,14 @@ _Camera = PinholeCamera | OrthographicCamera
 
 def free(light: Light, names: tuple[str, ...]) -> list[str]:
     """Those of the parameters that a light has."""
-    has = lambda name: hasattr(light, "inner_angle" if name == "angles" else name)
+    fields = {"angles": ("inner_angle",), "color": ("color", "coefficients")}
+    has = lambda name: any(hasattr(light, field) for field in fields.get(name, (name,)))
     return [name for name in names if has(name)]
+
+
+def color_shape(light: Light) -> tuple[int, int]:
+    """How many colors a light has, of which the image is a sum; and 3."""
+    return (9 if isinstance(light, SphericalHarmonicsLight) else 1), 3
 
 
 class Model(eqx.Module):
@@ -58,25 +64,32 @@ class Model(eqx.Module):
 
     def terms(self, lights: Sequence[Light]) -> list[Float[Array, "height width 3"]]:
         """The image of each light alone."""
-        name, shape = "lights(visibilities=...)", self.gbuffer.depth.shape
-        visibilities: list[Any] = [
-            share(name, entry(light), shape) if callable(entry) else entry
-            for light, entry in zip(lights, self.visibilities, strict=True)
-        ]
-        draw = functools.partial(shade, self.gbuffer, self.camera)
-        return [draw(*pair) for pair in zip(lights, visibilities, strict=True)]
+        pairs = zip(lights, self.visibilities, strict=True)
+        return [self._term(light, light, entry) for light, entry in pairs]
 
-    def basis(self, lights: Sequence[Light]) -> Float[Array, "light height width 3"]:
-        """The image of each light alone, if it were white."""
-        return jnp.stack(
-            self.terms([with_values(light, {"color": jnp.ones(3)}) for light in lights])
-        )
+    def _term(self, light: Light, place: Light, entry: Any) -> Float[Array, "height width 3"]:
+        """The image of a light with the shadow of one where `place` is."""
+        name, shape = "lights(visibilities=...)", self.gbuffer.depth.shape
+        visible = share(name, entry(place), shape) if callable(entry) else entry
+        return shade(self.gbuffer, self.camera, light, visible)
+
+    def basis(self, lights: Sequence[Light]) -> Float[Array, "color height width 3"]:
+        """The image of each color of each light alone, if it were white."""
+        images = []
+        for light, entry in zip(lights, self.visibilities, strict=True):
+            count, _ = color_shape(light)
+            for one in jnp.eye(count):
+                white = with_values(light, {"color": jnp.repeat(one, 3)})
+                images.append(self._term(white, light, entry))
+        return jnp.stack(images)
 
     def values(self, light: Light) -> Values:
         """The free parameters of a light; its direction as a step, 0 0, from where it is."""
         values = {"direction": jnp.zeros(2)} | {
             name: getattr(light, name) for name in ("color", "position") if hasattr(light, name)
         }
+        if isinstance(light, SphericalHarmonicsLight):
+            values["color"] = light.coefficients.reshape(-1)
         if isinstance(light, SpotLight):
             values["angles"] = jnp.stack([light.inner_angle, light.outer_angle])
         return {name: values[name] for name in free(light, self.names)}
@@ -84,6 +97,12 @@ class Model(eqx.Module):
 
 def with_values(light: Any, values: Values) -> Any:
     """A light with some of its parameters replaced, and its direction turned by a step."""
+    if isinstance(light, SphericalHarmonicsLight):
+        color = values.get("color", light.coefficients)
+        return SphericalHarmonicsLight(color.reshape(light.coefficients.shape))
+    if isinstance(light, EnvironmentLight):  # Of which only the color is free.
+        color = values.get("color", light.color)
+        return eqx.tree_at(lambda light: light.color, light, color)
     fields = {name: getattr(light, name) for name in vars(light)} | values
     if "direction" in values:
         fields["direction"] = _turned(light.direction, values["direction"])
@@ -159,18 +178,18 @@ class Residual(eqx.Module):
         if "color" in model.names:
             basis = model.basis(lights)
             colors = _ridge_colors(self.root[None] * basis, self.root * self.reference)
-            image = jnp.einsum("lc,lhwc->hwc", colors, basis)
+            image = jnp.einsum("kc,khwc->hwc", colors, basis)
         else:
             image = model(lights)
         return (self.root * (image - self.reference) / self.unit).astype(float)
 
 
 def _ridge_colors(
-    basis: Float[Array, "light height width 3"], reference: Float[Array, "height width 3"]
-) -> Float[Array, "light 3"]:
+    basis: Float[Array, "color height width 3"], reference: Float[Array, "height width 3"]
+) -> Float[Array, "color 3"]:
     """Colors close to the best, by normal equations with a ridge: differentiable everywhere.
 
-    `basis` is the image of each light if it is white.
+    `basis` is the image of each color if it is white.
     """
     gram = jnp.einsum("ihwc,jhwc->cij", basis, basis)
     right = jnp.einsum("ihwc,hwc->ci", basis, reference)
@@ -183,10 +202,10 @@ def _ridge_colors(
 
 
 def best_colors(
-    basis: Float[Array, "light height width 3"],
+    basis: Float[Array, "color height width 3"],
     reference: Float[Array, "height width 3"],
     root: Float[Array, "height width 1"],
-) -> Float[np.ndarray, "3 light"]:
+) -> Float[np.ndarray, "3 color"]:
     """The best colors, the smallest of them where several are as good, for the end of a search.
 
     `root` is the root of each pixel's weight.

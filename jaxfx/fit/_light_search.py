@@ -18,7 +18,15 @@ from jaxtyping import Array, Float
 
 from jaxfx.fit._descent import End, verdict
 from jaxfx.fit._light_errors import LEAST_NOISE, brightness, linearized
-from jaxfx.fit._light_model import Model, Residual, Search, best_colors, spread, with_values
+from jaxfx.fit._light_model import (
+    Model,
+    Residual,
+    Search,
+    best_colors,
+    color_shape,
+    spread,
+    with_values,
+)
 from jaxfx.fit._robust import CUT, biweight, lengths, noise_of
 from jaxfx.light import Light
 
@@ -121,10 +129,15 @@ def _lights(search, unknowns, reference, root):
 
 
 def _colored(lights: Sequence[Any], colors: np.ndarray) -> list[Any]:
-    return [
-        eqx.tree_at(lambda light: light.color, light, color)
-        for light, color in zip(lights, jnp.asarray(colors.T, float), strict=True)
-    ]
+    """The lights with these colors, 3 color, in their order."""
+    rest, colored = jnp.asarray(colors.T, float), []
+    for light in lights:
+        count, _ = color_shape(light)
+        own, rest = rest[:count].reshape(-1), rest[count:]
+        field = "color" if count == 1 else "coefficients"
+        select = lambda light, field=field: getattr(light, field)
+        colored.append(eqx.tree_at(select, light, own.reshape(select(light).shape)))
+    return colored
 
 
 def _warn_of_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None:
@@ -132,7 +145,7 @@ def _warn_of_what_does_not_move(model: Model, lights: tuple[Light, ...]) -> None
     values = [model.values(light) for light in lights]
     # Colors that are fitted are found whatever they were: a black one must not count as fixed.
     white = lambda light, own: with_values(
-        light, {"color": jnp.ones(3)} if "color" in own else {}
+        light, {"color": jnp.ones_like(own["color"])} if "color" in own else {}
     )
     columns = linearized(model, tuple(map(white, lights, values)))[1]
     is_moving = np.asarray(jnp.any(columns != 0, axis=0)).tolist()

@@ -53,11 +53,11 @@ class LightsFit(eqx.Module):
       and after every step, in squared units of radiance, always with the best colors where
       colors are fitted. It jumps where the pixels are reweighted.
     - `standard_errors`: for each light those of the parameters that were fitted, by name, in
-      their units: 3 for the color and the position, an angle in radians for the direction, 2
-      (inner, outer) for the angles. From a jackknife: the residuals of 8 x 8 tiles of the image
-      are taken for independent of one another, and no others. Never less than what noise of a
-      thousandth of the image's root mean square would make; inf where the image does not depend
-      on the parameter. Other minima are not in it.
+      their units: 3 for the color (9 3 for coefficients) and the position, an angle in radians
+      for the direction, 2 (inner, outer) for the angles. From a jackknife: the residuals of 8 x
+      8 tiles of the image are taken for independent of one another, and no others. Never less
+      than what noise of a thousandth of the image's root mean square would make; inf where the
+      image does not depend on the parameter. Other minima are not in it.
     - `indistinct`: groups of lights, by their indices, that the image can't tell apart: it
       stays the same, to a thousandth of what each change alone would do, when the parameters of
       all lights of the group change together; or they are of one kind, and their positions and
@@ -150,6 +150,7 @@ def lights(
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where six steps gain next to nothing.
     - `parameters`: the names to fit, out of `fit.LIGHT_PARAMETERS`; the others stay as given.
+      The coefficients of a `SphericalHarmonicsLight` are its colors.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the fit is no success; else `doubt` says why.
     - `progress`: show a bar on stderr; it needs the extra `plot`.

@@ -5,15 +5,23 @@ summed up beside them. And a light is added and taken out by one compiled loop, 
 are equal to the last bit.
 """
 
-from typing import NamedTuple, get_args
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfx._arguments import alike
 from jaxfx._loops import scan
 from jaxfx.light import AmbientLight, Light
-from jaxfx.relight.shading import Surface, received, shadowed, stack_visibilities
+from jaxfx.relight.shading import (
+    Surface,
+    received,
+    shadowed,
+    stack_visibilities,
+    with_reflectances,
+)
 
 
 _Image = Float[Array, "height width 3"]
@@ -27,22 +35,27 @@ class Sum(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """The sums over all lights but ambient ones.
+    """The sums over all lights but ambient ones, in the order of `received`.
 
-    `diffuse` and `specular` are before the reflectances multiply them. `nonfinite` counts, per
+    `diffuse` and `specular` are before the reflectances multiply them. `grazing` is what GGX
+    reflects whatever its reflectance, None where no pixel is of GGX. `nonfinite` counts, per
     pixel, the lights whose term is not finite. Those terms are left out of the sums: nothing
     could take them out again.
     """
 
     diffuse: Sum
     specular: Sum
+    grazing: Sum | None
     nonfinite: Int[Array, "height width"]
 
 
 def sums_of_none(surface: Surface) -> Sums:
     """The sums without any light."""
     zero = jnp.zeros_like(surface.position)
-    return Sums(Sum(zero, zero), Sum(zero, zero), jnp.zeros_like(surface.shader))
+    grazing = None if surface.facing is None else Sum(zero, zero)
+    return Sums(
+        Sum(zero, zero), Sum(zero, zero), grazing, nonfinite=jnp.zeros_like(surface.shader)
+    )
 
 
 @jax.jit
@@ -51,9 +64,8 @@ def with_lights(surface, sums, lights, visibilities, signs):
 
     One loop for each kind of light; ambient lights have no term.
     """
-    for kind in get_args(Light):
-        which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
-        if not which or kind is AmbientLight:
+    for which in alike(lights):
+        if isinstance(lights[which[0]], AmbientLight):
             continue
         group = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lights[i] for i in which))
         shadows = stack_visibilities([visibilities[i] for i in which], surface)
@@ -71,17 +83,21 @@ def _with_term(
 ) -> Sums:
     """The sums with one light's term times `sign`."""
     terms = jax.checkpoint(received, prevent_cse=False)(surface, light)
-    terms = tuple(shadowed(surface, term, visibility) for term in terms)
+    terms = {
+        index: shadowed(surface, term, visibility)
+        for index, term in enumerate(terms)
+        if term is not None
+    }
     # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once, with
     # a third less work; that of 0.10 drops the barrier and computes them again for each.
-    diffuse, specular = jax.lax.optimization_barrier(terms)
-    is_finite = jnp.isfinite(diffuse).all(axis=-1) & jnp.isfinite(specular).all(axis=-1)
-    signed = lambda term: jnp.where(is_finite[..., None], sign * term, 0)
-    return Sums(
-        _add(sums.diffuse, signed(diffuse)),
-        _add(sums.specular, signed(specular)),
-        sums.nonfinite + jnp.where(is_finite, 0, sign).astype(jnp.int32),
-    )
+    terms = jax.lax.optimization_barrier(terms)
+    are_finite = (jnp.isfinite(term).all(axis=-1) for term in terms.values())
+    is_finite = functools.reduce(jnp.logical_and, are_finite)
+    parts: list[Any] = [sums.diffuse, sums.specular, sums.grazing]
+    for index, term in terms.items():
+        parts[index] = _add(parts[index], jnp.where(is_finite[..., None], sign * term, 0))
+    nonfinite = sums.nonfinite + jnp.where(is_finite, 0, sign).astype(jnp.int32)
+    return Sums(parts[0], parts[1], parts[2], nonfinite)
 
 
 def _add(to: Sum, term: _Image) -> Sum:
@@ -98,8 +114,9 @@ def image_of(surface, sums, ambient):
 
     `ambient` holds pairs of a light and its visibility.
     """
-    diffuse, specular = (part.total + part.lost for part in (sums.diffuse, sums.specular))
-    image = surface.diffuse * diffuse + surface.specular * specular
+    whole = lambda part: part.total + part.lost
+    grazing = None if sums.grazing is None else whole(sums.grazing)
+    image = with_reflectances(surface, whole(sums.diffuse), whole(sums.specular), grazing)
     for light, visibility in ambient:
         term = light.color[None, None] * surface.ambient
         image = image + (term if visibility is None else visibility[..., None] * term)

@@ -121,4 +121,5 @@ def _as_surface(transfer: Transfer) -> Surface:
         diffuse=diffuse,
         specular=zero,
         exponent=jnp.zeros_like(one_row),
+        facing=None,
     )

@@ -1,8 +1,9 @@
 """Shading a deep frame buffer under given lights.
 
 At a pixel, a light is described by the direction towards it and its irradiance; a shader by the
-two unit vectors whose cosine, raised to a power, is its highlight. Everything is elementwise
-over pixels. `jaxfx.budget` uses `Surface`, `to_surface`, `reflected` and `check_shader`.
+two unit vectors whose cosine, raised to a power, is its highlight, or by the lobe of `_ggx`.
+Everything is elementwise over pixels. `jaxfx.budget` uses `Surface`, `to_surface`, `reflected`,
+`has_ggx` and `check_shader`.
 
 Cosines near 1 are computed as `1 - cosine`, half the squared distance between unit vectors, so
 that sharp highlights and narrow cones lose no digits and no cosine exceeds 1.
@@ -10,15 +11,18 @@ that sharp highlights and narrow cones lose no digits and no cosine exceeds 1.
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._arguments import check_camera, check_gbuffer, check_light, check_lights
+from jaxfx import _environment
+from jaxfx._arguments import alike, check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import check, share, shares
+from jaxfx._checks import check, is_concrete, share, shares
+from jaxfx._harmonics import irradiance as harmonic_irradiance
 from jaxfx._loops import scan
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
@@ -26,13 +30,22 @@ from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
-from jaxfx.light import AmbientLight, DirectionalLight, Light, PointLight, SpotLight
+from jaxfx.light import (
+    AmbientLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+    SphericalHarmonicsLight,
+    SpotLight,
+)
+from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing, mean_lobe, roughness_squared
 
 
 _Vectors = Float[Array, "height width 3"]
 _Scalars = Float[Array, "height width"]
-# Numbers of shaders in a G-buffer; 0, Lambert, has no highlight.
-_NOTHING, _PHONG, _BLINN = -1, 1, 2
+# Numbers of shaders in a G-buffer; 0, Lambert, has no highlight; 2 is Blinn.
+_NOTHING, _PHONG, _GGX = -1, 1, 3
 # Length of a vector: scene units, of those to lights. A shorter vector is divided by this in
 # place of its length, and so fades to zero. Smaller values let float32's second derivatives
 # overflow next to a light.
@@ -61,23 +74,23 @@ def shade(
     **Arguments:**
 
     - `gbuffer`, `camera`: the cache, height width, and the camera that it was made with.
-    - `light`: any of the four.
+    - `light`: of any kind.
     - `visibility`: height width, in [0, 1] or booleans: the share of the light that arrives,
       from a filter of `jaxfx.shadow` for instance. Left out, all of it arrives.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`. Exactly 0 where the
     shader is -1, the depth inf or missing (0, negative, NaN). A NaN elsewhere stays in its
-    pixel. A roughness below 1e-4 counts as 1e-4, and a light nearer to the surface than 1e-5
-    scene units fades out.
+    pixel. A roughness below 1e-4 counts as 1e-4, of GGX one below 0.01 as 0.01, and a light
+    nearer to the surface than 1e-5 scene units fades out.
 
     **Raises:** `ValueError` for a wrong shape, an unknown light or shader, or a visibility
-    outside [0, 1]. Traced values are not checked: any shader but 0, 1 and 2 is black, and any
+    outside [0, 1]. Traced values are not checked: any shader but 0 to 3 is black, and any
     visibility multiplies.
 
     **Gradient:** exact, forward and reverse, with respect to the light, the camera,
     `visibility` and every float image of the cache but `color`, which is not read. At N.L = 0,
-    R.V = 0 and N.H = 0 it is the one from the dark side, 0. A highlight that N.L = 0 cuts off
-    jumps there: that derivative is missing.
+    R.V = 0 and N.H = 0 it is the one from the dark side, 0. Phong's or Blinn's highlight that
+    N.L = 0 cuts off jumps there: that derivative is missing.
 
     **Example:** a Lambert wall that faces camera and light:
 
@@ -95,21 +108,29 @@ def shade(
     image of L about N, H halfway between L and V, and n = 2 / roughness**2 - 2, a pixel is
 
     - `color * ambient` under ambient light, `color` being the light's;
+    - what `SphericalHarmonicsLight` and `EnvironmentLight` state under one;
     - `E * diffuse * max(N.L, 0)` under any other, to which, where N.L > 0, Phong adds
       `E * specular * max(R.V, 0)**n` and Blinn `E * specular * max(N.H, 0)**n`.
+
+    GGX, glTF's metallic-roughness material, reflects `E * (1 - F) * diffuse * N.L` and a lobe
+    times `E * F`, with F = specular + (1 - specular) * (1 - V.H)**5: `relight/_ggx.py` has the
+    lobe. Its `diffuse` is `color * (1 - metallic)`, its `specular` the reflectance straight on:
+    `GBuffer.metallic_roughness` makes both. What it reflects of a light from everywhere is at
+    most that light for a metal. glTF's mix of the two parts gives a dielectric more where it is
+    seen at a grazing angle: a white one 1.03 at 30 degrees, 1.5 at 6 degrees, if it is smooth.
 
     E is the light's colour, over the squared distance for point and spot lights. A spot light's
     is also multiplied by `s * s * (3 - 2 * s)`, where s rises linearly in the cosine of the
     angle off its axis, from 0 at `outer_angle` to 1 at `inner_angle`.
 
     Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting;
-    the models are those of Phong 1975 and Blinn 1977.
+    the models are those of Phong 1975, Blinn 1977 and glTF 2.0 (Khronos 2017), appendix B.3.
     """
     gbuffer = check_cache("shade", gbuffer, camera)
     check_light("shade(light)", light)
     if visibility is not None:
         visibility = share("shade(visibility)", visibility, gbuffer.depth.shape)
-    return _shade(gbuffer, camera, light, visibility)
+    return _shade(gbuffer, camera, light, visibility, has_ggx(gbuffer))
 
 
 @on_any_mesh
@@ -157,14 +178,15 @@ def render(
     gbuffer = check_cache("render", gbuffer, camera)
     name, shape = "render(visibilities=...)", gbuffer.depth.shape
     visible = tuple(shares(name, visibilities, len(lights), shape))
-    return _render(gbuffer, camera, lights, visible)
+    return _render(gbuffer, camera, lights, visible, has_ggx(gbuffer))
 
 
 class Surface(NamedTuple):
     """The visible surface, per pixel: the part of shading that depends on no light.
 
     `normal` and `to_camera` are unit vectors in world space; the three reflectances are linear
-    RGB; `exponent` is that of the highlight.
+    RGB; `exponent` is that of the highlight. `facing` is N.V, which GGX reads, or None where no
+    pixel can have that shader: a program then has nothing of it.
     """
 
     shader: Int[Array, "height width"]
@@ -175,14 +197,25 @@ class Surface(NamedTuple):
     diffuse: _Vectors
     specular: _Vectors
     exponent: _Scalars
+    facing: _Scalars | None
 
 
-def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> Surface:
-    """The surface of a cache; where there is none, shader -1 and finite stand-ins."""
+def has_ggx(gbuffer: GBuffer) -> bool:
+    """Whether a pixel of a cache has the shader GGX, or may have it: where it is traced."""
+    return not is_concrete(gbuffer.shader) or bool((np.asarray(gbuffer.shader) == _GGX).any())
+
+
+def to_surface(
+    gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera, with_ggx: bool
+) -> Surface:
+    """The surface of a cache; where there is none, shader -1 and finite stand-ins.
+
+    `with_ggx` is static: `has_ggx` of the cache.
+    """
     dtype = working_dtype(gbuffer.color.dtype)
     shader = gbuffer.shader.astype(jnp.int32)
     has_depth = (gbuffer.depth > 0) & (gbuffer.depth != jnp.inf)
-    is_surface = (shader > _NOTHING) & (shader <= _BLINN) & has_depth
+    is_surface = (shader > _NOTHING) & (shader <= _GGX) & has_depth
     is_shiny = is_surface & (shader >= _PHONG)
 
     def masked(field: Array, stand_in: int, mask: Array = is_surface) -> Array:
@@ -194,15 +227,17 @@ def to_surface(gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera) -> 
     position = camera.unproject(pixels, depth)
     # At depth 0 lies the eye, or the start of an orthographic ray.
     to_camera = camera.unproject(pixels, jnp.zeros_like(depth)) - position
+    normal, to_camera = _unit(masked(gbuffer.normal, 0)), _unit(to_camera)
     return Surface(
         shader=jnp.where(is_surface, shader, _NOTHING),
         position=position,
-        normal=_unit(masked(gbuffer.normal, 0)),
-        to_camera=_unit(to_camera),
+        normal=normal,
+        to_camera=to_camera,
         ambient=masked(gbuffer.ambient, 0),
         diffuse=masked(gbuffer.diffuse, 0),
         specular=masked(gbuffer.specular, 0, is_shiny),
         exponent=exponent(masked(gbuffer.roughness, 1, is_shiny)),
+        facing=_dot(normal, to_camera) if with_ggx else None,
     )
 
 
@@ -218,23 +253,100 @@ def reflected(surface: Surface, light: Light) -> _Vectors:
         color = light.color.astype(surface.position.dtype)
         image = color[None, None] * surface.ambient
     else:
-        diffuse, specular = received(surface, light)
-        image = surface.diffuse * diffuse + surface.specular * specular
+        image = with_reflectances(surface, *received(surface, light))
     return jnp.where((surface.shader == _NOTHING)[..., None], 0, image)
 
 
+def with_reflectances(
+    surface: Surface, diffuse: _Vectors, specular: _Vectors | None, grazing: _Vectors | None
+) -> _Vectors:
+    """What the surface reflects of the three parts of the light that it receives."""
+    matte = surface.diffuse
+    if surface.facing is not None:
+        is_ggx = (surface.shader == _GGX)[..., None]
+        matte = matte * jnp.where(is_ggx, 1 - surface.specular, 1)
+    image = matte * diffuse
+    if specular is not None:
+        image = image + surface.specular * specular
+    return image if grazing is None else image + grazing
+
+
 def received(
-    surface: Surface, light: DirectionalLight | PointLight | SpotLight
-) -> tuple[_Vectors, _Vectors]:
-    """One light's diffuse and specular light, before the reflectances multiply it.
+    surface: Surface,
+    light: DirectionalLight
+    | PointLight
+    | SpotLight
+    | SphericalHarmonicsLight
+    | EnvironmentLight,
+) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
+    """One light's diffuse, specular and grazing light, before the reflectances multiply it.
 
     For the diffuse one that is the irradiance; for the specular one irradiance times highlight.
+    Of GGX the two are less a share, which the grazing one has whatever the reflectance. None
+    stands for no highlights, and for no pixel of GGX.
     """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
+    if isinstance(light, SphericalHarmonicsLight):
+        return _from_around(surface, surface.normal, light.coefficients), None, None
+    if isinstance(light, EnvironmentLight):
+        return _from_picture(surface, light)
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
     cosine = _dot(surface.normal, to_light)
+    halfway = _unit(to_light + surface.to_camera)
     diffuse = irradiance * jnp.where(cosine <= 0, 0, cosine)[..., None]
-    return diffuse, irradiance * _highlight(surface, to_light, cosine)[..., None]
+    highlight = _highlight(surface, to_light, halfway, cosine)
+    if surface.facing is None:
+        return diffuse, irradiance * highlight[..., None], None
+    is_ggx = surface.shader == _GGX
+    is_dark = (cosine <= 0) | (_dot(surface.normal, halfway) <= 0)
+    lobe, grazing = lobe_and_fresnel(
+        is_ggx & ~is_dark,
+        surface.exponent,
+        cosine,
+        surface.facing,
+        _one_minus_cosine(surface.normal, halfway),
+        _one_minus_cosine(surface.to_camera, halfway),
+    )
+    specular = irradiance * jnp.where(is_ggx, lobe, highlight)[..., None]
+    grazing = grazing[..., None]
+    return (1 - grazing) * diffuse, (1 - grazing) * specular, grazing * specular
+
+
+def _from_around(
+    surface: Surface, normal: _Vectors, coefficients: Float[Array, "9 3"]
+) -> _Vectors:
+    """The diffuse light of a radiance with these coefficients; none where a normal is zero.
+
+    `normal` is in the axes of the coefficients.
+    """
+    diffuse = harmonic_irradiance(normal, coefficients)
+    has_normal = _dot(surface.normal, surface.normal) != 0
+    if surface.facing is not None:
+        is_ggx = surface.shader == _GGX
+        diffuse *= jnp.where(is_ggx, 1 - mean_grazing(surface.facing), 1)[..., None]
+    return jnp.where(has_normal[..., None], diffuse, 0)
+
+
+def _from_picture(
+    surface: Surface, light: EnvironmentLight
+) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
+    """The three parts of the light of a picture of all directions."""
+    column = lambda k: jnp.broadcast_to(light.rotation[:, k], surface.normal.shape)
+    turned = lambda way: jnp.stack([_dot(way, column(k)) for k in range(3)], axis=-1)
+    color = light.color[None, None]
+    diffuse = color * _from_around(surface, turned(surface.normal), light.coefficients)
+    if surface.facing is None:
+        return diffuse, None, None
+    mirrored = 2 * surface.facing[..., None] * surface.normal - surface.to_camera
+    lobe = mean_lobe(surface.facing, jnp.sqrt(roughness_squared(surface.exponent)))
+    toward = surface.normal + lobe.mirrored[..., None] * (mirrored - surface.normal)
+    picture = _environment.look_up(light.pyramid, light.heights, turned(toward), lobe.roughness)
+    is_ggx = (surface.shader == _GGX) & (_dot(surface.normal, surface.normal) != 0)
+    specular, grazing = (
+        jnp.where(is_ggx[..., None], color * picture * mean[..., None], 0)
+        for mean in (lobe.specular, lobe.grazing)
+    )
+    return diffuse, specular, grazing
 
 
 def _direction_and_irradiance(
@@ -261,11 +373,12 @@ def _cone(light: SpotLight, to_light: _Vectors) -> _Scalars:
     return step * step * (3 - 2 * step)
 
 
-def _highlight(surface: Surface, to_light: _Vectors, cosine: _Scalars) -> _Scalars:
+def _highlight(
+    surface: Surface, to_light: _Vectors, halfway: _Vectors, cosine: _Scalars
+) -> _Scalars:
     """Phong's max(R.V, 0)**n or else Blinn's max(N.H, 0)**n; 0 where N.L <= 0."""
     is_phong = (surface.shader == _PHONG)[..., None]
     mirrored = 2 * cosine[..., None] * surface.normal - to_light
-    halfway = _unit(to_light + surface.to_camera)
     a = jnp.where(is_phong, mirrored, surface.normal)
     b = jnp.where(is_phong, surface.to_camera, halfway)
     one_minus_cosine = _one_minus_cosine(a, b)
@@ -303,8 +416,9 @@ def check_cache(function: str, gbuffer: Any, camera: Any) -> GBuffer:
 
 
 def check_shader(gbuffer: GBuffer) -> GBuffer:
-    """The cache; `ValueError` where a concrete shader is none of -1, 0, 1 and 2."""
-    check("GBuffer(shader)", gbuffer.shader, lambda v: (v >= -1) & (v <= 2), "-1, 0, 1 or 2")
+    """The cache; `ValueError` where a concrete shader is none of -1, 0, 1, 2 and 3."""
+    is_known = lambda v: (v >= _NOTHING) & (v <= _GGX)
+    check("GBuffer(shader)", gbuffer.shader, is_known, "-1, 0, 1, 2 or 3")
     return gbuffer
 
 
@@ -328,25 +442,23 @@ def shadowed(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> 
     return visibility[..., None] * image
 
 
-@jax.jit
-def _shade(gbuffer, camera, light, visibility):
-    surface = to_surface(gbuffer, camera)
+@partial(jax.jit, static_argnames="with_ggx")
+def _shade(gbuffer, camera, light, visibility, with_ggx):
+    surface = to_surface(gbuffer, camera, with_ggx)
     image = shadowed(surface, reflected(surface, light), visibility)
     return image.astype(gbuffer.color.dtype)
 
 
-@jax.jit
-def _render(gbuffer, camera, lights, visibilities):
-    surface = to_surface(gbuffer, camera)
+@partial(jax.jit, static_argnames="with_ggx")
+def _render(gbuffer, camera, lights, visibilities, with_ggx):
+    surface = to_surface(gbuffer, camera, with_ggx)
     image = jnp.zeros_like(surface.position)
     stack = lambda *leaves: jnp.stack([leaf.astype(image.dtype) for leaf in leaves])
-    for kind in get_args(Light):
-        which = [i for i, light in enumerate(lights) if isinstance(light, kind)]
-        if which:
-            group = jax.tree.map(stack, *(lights[i] for i in which))
-            shadows = stack_visibilities([visibilities[i] for i in which], surface)
-            terms = surface, image, (group, shadows)
-            image = by_platform(*terms, cpu=_one_by_one, accelerator=_together)
+    for which in alike(lights):
+        group = jax.tree.map(stack, *(lights[i] for i in which))
+        shadows = stack_visibilities([visibilities[i] for i in which], surface)
+        terms = surface, image, (group, shadows)
+        image = by_platform(*terms, cpu=_one_by_one, accelerator=_together)
     return image.astype(gbuffer.color.dtype)
 
 

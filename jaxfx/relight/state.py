@@ -23,11 +23,13 @@ from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight._sums import Sums, image_of, sums_of_none, with_lights
-from jaxfx.relight.shading import Surface, check_cache, exponent, to_surface
+from jaxfx.relight.shading import Surface, check_cache, exponent, has_ggx, to_surface
 
 
 _Image = Float[Array, "height width 3"]
 _Visibility = Float[Array, "height width"]
+
+_to_surface = jax.jit(to_surface, static_argnums=2)
 
 
 @on_any_mesh
@@ -78,7 +80,7 @@ def start(
     gbuffer = check_cache("start", gbuffer, camera)
     name, shape = "start(visibilities=...)", gbuffer.depth.shape
     visibilities = shares(name, visibilities, len(lights), shape)
-    surface = jax.jit(to_surface)(gbuffer, camera)
+    surface = _to_surface(gbuffer, camera, has_ggx(gbuffer))
     empty = RelightState(
         color=gbuffer.color.astype(surface.position.dtype),
         surface=surface,

@@ -11,6 +11,7 @@
 | the surface behind the first one | `gbuffer` or `depth` with `layer_index=1` |
 | masks of objects or materials | `object_ids`, `material_ids` |
 | traced shadows | `visible` |
+| where to put few cameras that see what many see | `plan_views` |
 | one bounce of indirect light | `transfer`, then `relight.indirect` |
 
 OpenGL or Embree finds the face that every pixel shows; NumPy does the rest. Nothing here can be
@@ -21,6 +22,7 @@ those of `jaxfx`.
 from jaxfx.scene._defaults import default_camera, default_lights
 from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._plan import ViewPlan, plan_views
 from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Scene, Viewpoint
 from jaxfx.scene._still_life import still_life
@@ -31,6 +33,7 @@ __all__ = [
     "Material",
     "Sampler",
     "Scene",
+    "ViewPlan",
     "Viewpoint",
     "default_camera",
     "default_lights",
@@ -40,6 +43,7 @@ __all__ = [
     "load",
     "material_ids",
     "object_ids",
+    "plan_views",
     "still_life",
     "transfer",
     "visible",

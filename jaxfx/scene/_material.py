@@ -8,12 +8,14 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 
+from jaxfx._checks import option
 from jaxfx.io import linear_from_srgb
 
 
-# The fields of `Material` that are textures, and the names of wrap modes.
+# The fields of `Material` that are textures, and the names of wrap modes and shaders.
 TEXTURES = ("texture", "metallic_roughness", "normal_map")
 WRAPS = ("repeat", "mirror", "clamp")
+SHADERS = ("blinn", "ggx")
 
 
 @final
@@ -78,8 +80,12 @@ class Material:
     - `normal_scale`: multiplies the normal's components along u and v.
     - `samplers`: a `Sampler` for each texture, by the name of the argument: "texture",
       "metallic_roughness" or "normal_map". The default repeats and is bilinear.
+    - `shader`: how it reflects: "ggx" as glTF states it; "blinn" with Blinn's highlight, and
+      without any where the roughness is 1 and the metallic 0. Materials of glTF files and
+      trimesh's `PBRMaterial` are "ggx", those of other files "blinn".
 
-    **Raises:** `ValueError` for a number out of range, or a texture of another shape or type.
+    **Raises:** `ValueError` for an unknown shader, a number out of range, or a texture of
+    another shape or type.
 
     **Gradient:** none; the host side.
 
@@ -99,8 +105,10 @@ class Material:
     normal_map: UInt8[np.ndarray, "e f 3"] | UInt16[np.ndarray, "e f 3"] | None = None
     normal_scale: float | int = 1.0
     samplers: Mapping[str, Sampler] = field(default_factory=dict)
+    shader: str = "blinn"
 
     def __post_init__(self):
+        option("Material(shader=...)", self.shader, SHADERS)
         if np.shape(self.color) != (3,) or not np.isfinite(self.color).all():
             raise ValueError(f"`Material(color=...)` must be linear RGB, got {self.color}.")
         for name in ("metallic", "roughness"):

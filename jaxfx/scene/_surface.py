@@ -12,14 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfx.gbuffer import GBuffer
+from jaxfx.gbuffer import DIELECTRIC, GBuffer
 from jaxfx.scene._material import Material, Sampler, sample_texture
 from jaxfx.scene._scene import Scene
 from jaxfx.scene._view import View
 
 
-# Reflectance at normal incidence of a dielectric of refractive index 1.5, as glTF 2.0 has it.
-_DIELECTRIC = 0.04
 # How far outside its face a hit may lie, in barycentric weight. A smaller value clips the depth
 # of pixels that a rasteriser gave to a face which their centre just misses; a larger one allows
 # very wrong depths for a face seen edge-on.
@@ -92,13 +90,15 @@ def to_gbuffer(scene: Scene, view: View, hits: Hits, height: int, width: int) ->
     """The G-buffer of the hits; background in all other pixels."""
     color, metallic, roughness = _materials(scene, hits)
     dielectric = (1 - metallic)[:, None]
-    specular = _DIELECTRIC * dielectric + color * metallic[:, None]
-    shader = np.where((roughness < 1) | (metallic > 0), np.int32(2), np.int32(0))
+    specular = DIELECTRIC * dielectric + color * metallic[:, None]
+    is_ggx = np.array([material.shader == "ggx" for material in scene.materials])
+    is_shiny = (roughness < 1) | (metallic > 0)
+    shader = np.where(is_ggx[scene.face_materials.take(hits.face)], 3, 2 * is_shiny)
     image = partial(_image, hits.pixel, (height, width))
     base = image(color, 0)
     return GBuffer(
         color=base,
-        shader=image(shader, -1),
+        shader=image(shader.astype(np.int32), -1),
         ambient=base,
         diffuse=image(color * dielectric, 0),
         specular=image(specular, 0),

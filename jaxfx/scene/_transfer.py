@@ -75,7 +75,7 @@ def visible(
     >>> print(scene.visible(box, np.array([0.0, 0, 2]), np.array([[0.0, 0, -2], [0, 2, 2]])))
     [False  True]
     """
-    _require_embree("visible")
+    require_embree("visible")
     points = []
     for name, value in (("origin", origin), ("end", end)):
         array = as_numpy(f"scene.visible({name})", value)
@@ -137,7 +137,7 @@ def transfer(
     Source: Hasan, Pellacini & Bala 2006, with singular vectors for their wavelets; the disc is
     Wallace, Elmquist & Haines 1989's.
     """
-    _require_embree("transfer")
+    require_embree("transfer")
     check_camera("scene.transfer(camera)", camera)
     gbuffer = check_gbuffer("scene.transfer(gbuffer)", gbuffer)
     point_count = _count("point_count", point_count, None)
@@ -248,7 +248,7 @@ def _count(name: str, value: Any, largest: int | None) -> int:
     return whole_number(name, count, is_valid, limit)
 
 
-def _require_embree(caller: str) -> None:
+def require_embree(caller: str) -> None:
     """Raise `RuntimeError` that names `caller` where Embree does not work."""
     if problem := embree.problem():
         raise RuntimeError(f"`scene.{caller}` needs Embree: {problem}")

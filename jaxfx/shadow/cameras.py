@@ -12,7 +12,14 @@ from jaxfx._checks import WholeNumber, check, parameter, whole_number
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import normalize
 from jaxfx.camera import OrthographicCamera, PinholeCamera
-from jaxfx.light import AmbientLight, DirectionalLight, Light, SpotLight
+from jaxfx.light import (
+    AmbientLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    SphericalHarmonicsLight,
+    SpotLight,
+)
 
 
 # Of each face of a cube: the axis that its camera looks along, and its up axis, in world space.
@@ -92,7 +99,7 @@ def light_cameras(
         "positive",
     )
     inner = map_size - 2 * margin
-    if isinstance(light, AmbientLight):
+    if isinstance(light, AmbientLight | SphericalHarmonicsLight | EnvironmentLight):
         return ()
     if isinstance(light, DirectionalLight):
         forward = normalize(light.direction)

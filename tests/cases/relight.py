@@ -409,3 +409,7 @@ not_measured(
     "There is no figure to it: Blender finds every pass under its name and to the bit, or a"
     " test in tests/exr fails. It is skipped where Blender is not installed.",
 )
+
+
+# The cases of materials and of light from all around, which come last.
+import tests.cases.relight_materials  # noqa: E402, F401

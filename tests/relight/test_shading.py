@@ -399,15 +399,16 @@ def test_any_size_and_batches_of_lights(size):
 
 
 def test_an_unknown_shader_is_named_or_black():
-    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1 or 2"):
-        relight.shade(one_pixel(3), FRONT, LIGHTS["ambient"])
-    assert not jax.jit(relight.shade)(one_pixel(3), FRONT, LIGHTS["ambient"]).any()
+    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1, 2 or 3"):
+        relight.shade(one_pixel(4), FRONT, LIGHTS["ambient"])
+    assert not jax.jit(relight.shade)(one_pixel(4), FRONT, LIGHTS["ambient"]).any()
 
 
 def test_errors_name_the_argument():
     shade, render = inspect.unwrap(relight.shade), inspect.unwrap(relight.render)
     gbuffer, camera, light = make_gbuffer(0), make_camera("pinhole", 7, 9), LIGHTS["point"]
-    kinds = "AmbientLight, DirectionalLight, PointLight, SpotLight"
+    kinds = "AmbientLight, DirectionalLight, PointLight, SpotLight, SphericalHarmonicsLight, "
+    kinds += "EnvironmentLight"
     for visibility in (np.ones((9, 7)), np.ones((7, 9, 1)), 1.0):
         with pytest.raises(ValueError, match=r"`shade\(visibility\)` must have shape \(7, 9\)"):
             shade(gbuffer, camera, light, visibility)

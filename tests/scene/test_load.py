@@ -142,7 +142,7 @@ def test_glb_factors(tmp_path, straight, backend):
     np.testing.assert_allclose(buffer.diffuse, base * 0.75, atol=1e-6)
     np.testing.assert_allclose(buffer.specular, 0.04 * 0.75 + base * 0.25, atol=1e-6)
     np.testing.assert_allclose(buffer.roughness, 0.5)
-    np.testing.assert_array_equal(buffer.shader, 2)
+    np.testing.assert_array_equal(buffer.shader, 3)
 
 
 @pytest.mark.parametrize("metallic", [{"metallicFactor": 1.0}, {}])
@@ -152,7 +152,7 @@ def test_glb_metal_however_rough_is_no_lambertian(tmp_path, straight, metallic):
         tmp_path, baseColorFactor=[51, 102, 255, 255], roughnessFactor=1.0, **metallic
     )
     buffer = scene.gbuffer(scene.load(path), straight(2), height=2, width=3, backend="embree")
-    np.testing.assert_array_equal(buffer.shader, 2)
+    np.testing.assert_array_equal(buffer.shader, 3)
     np.testing.assert_array_equal(buffer.diffuse, 0)
     np.testing.assert_allclose(buffer.specular[0, 0], [0.2, 0.4, 1], atol=1e-6)
 
@@ -272,7 +272,7 @@ def test_one_mesh_of_two_materials(straight):
     )
     np.testing.assert_allclose(buffer.color[1, 2], [0.2, 0.2, 0.2], atol=1e-6)
     np.testing.assert_allclose(buffer.color[0, 0], [1, 0.4, 0.2], atol=1e-6)
-    assert (buffer.shader[1, 2], buffer.shader[0, 0]) == (0, 2)
+    assert (buffer.shader[1, 2], buffer.shader[0, 0]) == (3, 3)
 
 
 def test_missing_file(tmp_path):

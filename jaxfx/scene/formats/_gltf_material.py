@@ -82,6 +82,7 @@ class Materials:
             roughness=ratio(surface, "roughnessFactor", 1.0),
             normal_scale=float(take(normal, "scale", float, 1.0)),
             samplers=samplers,
+            shader="ggx",
             **images,
         )
         return UsedMaterial(material, sets)

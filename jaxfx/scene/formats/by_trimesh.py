@@ -175,6 +175,7 @@ def _pbr(material: Any, has_uv: bool) -> Material:
         roughness=1.0 if roughness is None else float(np.clip(roughness, 0, 1)),
         metallic_roughness=_image(texture) if has_uv else None,
         normal_map=_image(material.normalTexture) if has_uv else None,
+        shader="ggx",
     )
 
 

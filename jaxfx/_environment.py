@@ -1,0 +1,165 @@
+"""A picture of all directions: its spherical harmonics, and its blurs for rough mirrors.
+
+Axes of a picture: y up, row 0 at the top; the middle column looks along -z, the right half lies
+at +x. So a texel's direction is (cos(b) sin(a), sin(b), -cos(b) cos(a)), a being its angle to
+the right of the middle, b that above the horizon.
+
+A blur is for one roughness: the mean of the radiance about a direction, weighted by GGX's lobe
+as it is seen straight on. Directions of one row differ by a turn about y: so a blur is a
+product of matrices over rows and a convolution along them, which is a product after a Fourier
+transform.
+
+Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001, the nine coefficients. Blurring
+by a Fourier transform along rows is our own.
+"""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfx._harmonics import FACTORS
+from jaxfx._numerics import safe_sqrt
+
+
+# The roughness of each level, and the most rows that it has, some two to a lobe's width. Level
+# 0 is the picture. More rows take memory with their cube; fewer blur once more.
+ROUGHNESSES = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
+_MOST_ROWS = (128, 64, 64, 32, 32, 32, 32)
+
+
+def heights(height: int) -> tuple[int, ...]:
+    """The rows of each level for a picture of `height` rows."""
+    return height, *(min(height, most) for most in _MOST_ROWS)
+
+
+def blurs(image: Float[Array, "height width 3"]) -> Float[Array, "texel 3"]:
+    """The texels of all levels, one level after another, row by row."""
+    rows = heights(image.shape[0])
+    smaller = {height: _shrunk(image, height) for height in set(rows)}
+    levels = [image]
+    for height, roughness in zip(rows[1:], ROUGHNESSES[1:], strict=True):
+        weights = jnp.asarray(_lobes(height, roughness), image.dtype)
+        waves = jnp.fft.rfft(smaller[height], axis=1)
+        parts = [
+            jnp.einsum("oif,ifc->ofc", weights, part, precision="highest")
+            for part in (waves.real, waves.imag)
+        ]
+        levels.append(jnp.fft.irfft(jax.lax.complex(*parts), n=2 * height, axis=1))
+    return jnp.concatenate([level.astype(image.dtype).reshape(-1, 3) for level in levels])
+
+
+@functools.cache
+def _lobes(height: int, roughness: float) -> Float[np.ndarray, "row row wave"]:
+    """Weights of each row, after a Fourier transform along it, in the blur of each row."""
+    sine, cosine = np.sin(_latitudes(height)), np.cos(_latitudes(height))
+    turn = np.arange(2 * height) * np.pi / height
+    between = sine[:, None, None] * sine[None, :, None]
+    between = between + cosine[:, None, None] * cosine[None, :, None] * np.cos(turn)
+    squared, alpha = (1 + np.clip(between, -1, 1)) / 2, roughness**2  # (N.H)**2
+    lobe = np.maximum(between, 0) / (squared * (alpha**2 - 1) + 1) ** 2
+    lobe *= cosine[None, :, None]  # A texel's share of the sphere.
+    lobe /= lobe.sum(axis=(1, 2), keepdims=True)
+    return np.fft.rfft(lobe, axis=-1).real  # It is even.
+
+
+def _latitudes(height: int) -> Float[np.ndarray, " height"]:
+    """The angle of each row above the horizon."""
+    return (0.5 - (np.arange(height) + 0.5) / height) * np.pi
+
+
+def _shrunk(image: Float[Array, "height width 3"], height: int) -> Float[Array, "_ _ 3"]:
+    """The picture with fewer rows: means by area."""
+    if height == image.shape[0]:
+        return image
+    down, across = _means(image.shape[0], height), _means(image.shape[1], 2 * height)
+    down = down * np.cos(_latitudes(image.shape[0]))
+    down /= down.sum(axis=1, keepdims=True)
+    down, across = jnp.asarray(down, image.dtype), jnp.asarray(across, image.dtype)
+    image = jnp.einsum("oi,iwc->owc", down, image, precision="highest")
+    return jnp.einsum("oi,hic->hoc", across, image, precision="highest")
+
+
+def _means(size: int, to: int) -> Float[np.ndarray, "to size"]:
+    """Means over `to` equal parts of `size` texels."""
+    edges = np.linspace(0, size, to + 1)
+    low = np.maximum(edges[:-1, None], np.arange(size))
+    high = np.minimum(edges[1:, None], np.arange(size) + 1)
+    return np.maximum(high - low, 0) * (to / size)
+
+
+def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
+    """The coefficients of `_harmonics`, in the picture's axes."""
+    height, width = image.shape[:2]
+    # Means over texels, in which the radiance is even: by four nodes along each side.
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    inside = (nodes + 1) / 2
+    mean = lambda values: values @ (weights / 2)
+    angle = ((np.arange(width)[:, None] + inside) / width - 0.5) * 2 * np.pi
+    s, c = np.sin(angle), np.cos(angle)
+    columns = [mean(value) for value in (1 + 0 * s, s, c, s * s, s * c, c * c)]
+    along = jnp.asarray(np.stack(columns), image.dtype)
+    rows = jnp.einsum("kw,hwc->khc", along, image, precision="highest")
+    above = (0.5 - (np.arange(height)[:, None] + inside) / height) * np.pi
+    y, r = np.sin(above), np.cos(above)
+    solid_angle = r * 2 * np.pi**2 / (height * width)
+    # 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy, as (row's factor, index of `along`).
+    polynomials = [
+        [(1 + 0 * y, 0)],
+        [(y, 0)],
+        [(-r, 2)],
+        [(r, 1)],
+        [(r * y, 1)],
+        [(-r * y, 2)],
+        [(3 * r * r, 5), (-1 + 0 * y, 0)],
+        [(-r * r, 4)],
+        [(r * r, 3), (-y * y, 0)],
+    ]
+    factors = np.zeros((9, 6, height))
+    for k, terms in enumerate(polynomials):
+        for factor, index in terms:
+            factors[k, index] = mean(factor * solid_angle) * FACTORS[k]
+    factors = jnp.asarray(factors, image.dtype)
+    return jnp.einsum("mkh,khc->mc", factors, rows, precision="highest")
+
+
+def look_up(
+    pyramid: Float[Array, "texel 3"],
+    rows: tuple[int, ...],
+    direction: Float[Array, "height width 3"],
+    roughness: Float[Array, "height width"],
+) -> Float[Array, "height width 3"]:
+    """The blur of that roughness in these directions, linear between texels and levels."""
+    x, y, z = (direction[..., k] for k in range(3))
+    across = x * x + z * z
+    is_up = across == 0  # There an angle about the axis is no angle.
+    right = jnp.where(is_up, 0, jnp.arctan2(jnp.where(is_up, 0, x), jnp.where(is_up, 1, -z)))
+    above = jnp.arctan2(y, jnp.where(is_up, 1, safe_sqrt(across)))
+    above = jnp.where(is_up, jnp.sign(y) * (jnp.pi / 2), above)
+    steps = itertools.pairwise(ROUGHNESSES)
+    level = sum(jnp.clip((roughness - low) / (high - low), 0, 1) for low, high in steps)
+    first = jnp.clip(jnp.floor(level), 0, len(rows) - 2).astype(jnp.int32)
+    starts = np.cumsum([0, *(2 * height * height for height in rows)])[:-1]
+
+    def texels(index):
+        height = jnp.asarray(rows, jnp.int32)[index]
+        size, start = height.astype(x.dtype), jnp.asarray(starts, jnp.int32)[index]
+        column = (right / (2 * jnp.pi) + 0.5) * 2 * size - 0.5
+        row = jnp.clip((0.5 - above / jnp.pi) * size - 0.5, 0, size - 1)
+        left, top = jnp.floor(column), jnp.floor(row)
+        s, t = (column - left)[..., None], (row - top)[..., None]
+        left, top = left.astype(jnp.int32), top.astype(jnp.int32)
+        below = jnp.minimum(top + 1, height - 1)
+
+        def at(row, column):
+            flat = start + row * (2 * height) + column % (2 * height)
+            return pyramid.at[flat].get(mode="clip")
+
+        upper = (1 - s) * at(top, left) + s * at(top, left + 1)
+        return (1 - t) * upper + t * ((1 - s) * at(below, left) + s * at(below, left + 1))
+
+    t = (level - first.astype(x.dtype))[..., None]
+    return (1 - t) * texels(first) + t * texels(first + 1)
