@@ -280,6 +280,7 @@ CALLS = {
         ft.partial(ThinLens.circle_of_confusion, LENS),
         {"depth": DEPTH},
     ),
+    "dof.Iris": (dof.Iris, {"blades": 6, "rotation": 0.1, "roundness": 0.2, "squeeze": 0.9}),
     "FocusPlanes": (FocusPlanes, {"near": 1.0, "focus": 2.0, "far": 3.0, "max_coc": 4.0}),
     "PinholeCamera": (
         PinholeCamera,

@@ -19,6 +19,7 @@ from jaxfx.dof.blend import blend
 from jaxfx.dof.depth_sorted import depth_sorted
 from jaxfx.dof.diffusion import anisotropic_diffusion, implicit_diffusion
 from jaxfx.dof.gather import gather
+from jaxfx.dof.iris import Iris
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
 from jaxfx.dof.separable import separable
@@ -26,6 +27,7 @@ from jaxfx.dof.separable import separable
 
 __all__ = [
     "Accumulation",
+    "Iris",
     "accumulate",
     "anisotropic_diffusion",
     "blend",
