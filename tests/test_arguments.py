@@ -275,6 +275,10 @@ CALLS = {
     ),
     "depth.fill": (depth.fill, {"depth": DEPTH, "image": IMAGE}),
     "ThinLens": (ThinLens, {"aperture": 0.1, "focus_distance": 2.0, "focal_pixels": 30.0}),
+    "ThinLens.from_disparity": (
+        ThinLens.from_disparity,
+        {"strength": 8.0, "focus_disparity": 0.5, "scale": 2.0, "shift": 0.1},
+    ),
     "ThinLens.defocus": (ft.partial(ThinLens.defocus, LENS), {"depth": DEPTH}),
     "ThinLens.circle_of_confusion": (
         ft.partial(ThinLens.circle_of_confusion, LENS),
