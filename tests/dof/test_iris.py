@@ -229,6 +229,58 @@ def test_energy_of_lights_is_kept():
         assert abs(lit - 25 * float(iris.area())) < 40
 
 
+@pytest.mark.parametrize("behind", [False, True])
+def test_layered_by_an_iris_without_blades_is_the_disc(behind):
+    """Two programs: this one paints all slices of a group by the same chords."""
+    rng = np.random.default_rng(0)
+    image = jnp.asarray(rng.random((20, 24, 2)))
+    depth = jnp.asarray(np.where(np.arange(24) < 11, 1.2, 3.0) + 0.3 * rng.random((20, 24)))
+    second = (image[::-1], depth + 2.0) if behind else None
+    lens = ThinLens(1.0, 2.0, 14.0)
+    expected = dof.layered(image, depth, lens, behind=second)
+    result = dof.layered(image, depth, lens, behind=second, iris=Iris())
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+
+
+def test_layered_shows_as_much_past_an_edge_as_the_iris_sees():
+    """A black plane left of x = 16, twelve pixels out of focus, before a white one in focus."""
+    iris, radius, edge = Iris(3, rotation=0.4, squeeze=0.7), 6.0, 16
+    lens = ThinLens(1.0, 2.0, 24.0)
+    is_left = np.broadcast_to(np.arange(32) < edge, (20, 32))
+    image, depth = (~is_left[..., None]).astype(float), np.where(is_left, 1.0, 2.0)
+    behind = np.ones_like(image), np.where(is_left, 2.0, np.inf)
+    result = dof.layered(image, depth, lens, behind=behind, max_coc=12.0, iris=iris)
+    shape = polygon(iris)
+    whole, _ = area_and_moment(shape)
+    for x in range(5, 27):
+        # The sprites of the foreground are turned: from a pixel one looks along the shape.
+        seen, _ = area_and_moment(clipped(radius * shape, 0, -99, edge - x - 0.5))
+        expected = 1 - seen / whole / radius**2
+        # Ends of spans are sharp within a row: exact is the area of rows, not of columns.
+        assert abs(float(result[10, x, 0]) - expected) < 0.02
+
+
+@first("iris", [Iris(5, rotation=0.2, roundness=0.3, squeeze=0.8), Iris(6, squeeze=0.9)])
+@pytest.mark.full
+def test_layered_derivatives(iris):
+    rng = np.random.default_rng(4)
+    image, weight = (jnp.asarray(rng.random((9, 10, 2))) for _ in range(2))
+    depth = jnp.asarray(np.where(np.arange(10) < 5, 1.3, 3.1) + 0.2 * rng.random((9, 10)))
+
+    def loss(image, depth, second, numbers, rotation, squeeze, roundness):
+        aperture, focus, threshold = numbers
+        lens = ThinLens(aperture, focus, 14.0)
+        shape = eqx.tree_at(lambda x: (x.rotation, x.squeeze), iris, (rotation, squeeze))
+        if iris.blades == 5:
+            shape = eqx.tree_at(lambda x: x.roundness, shape, roundness)
+        options = {"max_coc": 6.0, "threshold": threshold, "behind": (second, depth + 2.0)}
+        return jnp.sum(weight * dof.layered(image, depth, lens, iris=shape, **options))
+
+    numbers = jnp.asarray([0.9, 2.03, 1.7])
+    operands = image, depth, image[::-1], numbers, iris.rotation, iris.squeeze, iris.roundness
+    check_slopes(loss, operands, atol=2e-5, rtol=2e-5, eps=1e-6)
+
+
 def test_errors_name_what_is_wrong():
     image, depth = random_scene(0)
     lens = ThinLens(0.1, 2.5, 80.0)
@@ -237,6 +289,8 @@ def test_errors_name_what_is_wrong():
             dof.scatter(image, depth, lens, iris=Iris(6), program=program)
     with pytest.raises(ValueError, match=r"scatter\(iris=...\)` must be an Iris, got int"):
         inspect.unwrap(dof.scatter)(image, depth, lens, iris=6)
+    with pytest.raises(ValueError, match=r"layered\(iris=...\)` must be an Iris, got int"):
+        inspect.unwrap(dof.layered)(image, depth, lens, iris=6)
     for wrong in ({"blades": 2}, {"roundness": 1.1}, {"squeeze": 0.0}, {"squeeze": 1.2}):
         (name,) = wrong
         with pytest.raises(ValueError, match=rf"Iris\({name}\)"):
