@@ -22,13 +22,11 @@ from jaxfx._checks import (
     parameter,
     whole_number,
 )
+from jaxfx.dof.sprites import row_half_width
 
 
-# Arcs that stand for a disc, and the fewest sides that a shape has.
-_DISC_ARCS, _FEWEST = 4, 3
-# Square of the sine of half an arc's angle below which a segment's area is taken from its
-# series: above, the closed form loses at most a digit in float32; below, the series is exact.
-_SHORT_ARC = 0.04
+# The fewest sides that a shape has.
+_FEWEST = 3
 
 
 @final
@@ -68,7 +66,7 @@ class Iris(eqx.Module):
 
     blades: int = eqx.field(static=True)
     rotation: Float[Array, ""]
-    roundness: Float[Array, ""]
+    roundness: Float[Array, ""] | None
     squeeze: Float[Array, ""]
 
     def __init__(
@@ -81,10 +79,10 @@ class Iris(eqx.Module):
         is_count = lambda n: n == 0 or n >= _FEWEST
         self.blades = whole_number("Iris(blades)", blades, is_count, "0, or an integer from 3")
         self.rotation = parameter("Iris(rotation)", rotation)
-        self.roundness = parameter("Iris(roundness)", roundness)
+        self.roundness = bend = parameter("Iris(roundness)", roundness)
         self.squeeze = parameter("Iris(squeeze)", squeeze)
         check("Iris(rotation)", self.rotation, np.isfinite, "finite")
-        check("Iris(roundness)", self.roundness, lambda v: (v >= 0) & (v <= 1), "from 0 to 1")
+        check("Iris(roundness)", bend, lambda v: (v >= 0) & (v <= 1), "from 0 to 1")
         is_ratio = lambda v: (v > 0) & (v <= 1)
         check("Iris(squeeze)", self.squeeze, is_ratio, "above 0 and at most 1")
 
@@ -95,21 +93,23 @@ class Iris(eqx.Module):
 
         **Gradient:** exact; zero in `rotation`.
         """
-        arcs, curvature = self._bent()
-        half = math.sin(math.pi / arcs)
-        triangle = math.sin(2 * math.pi / arcs) / 2
-        segment, _ = _segment(jnp.asarray(4 * half * half, curvature.dtype), curvature)
-        return arcs * (triangle + segment) * self.squeeze
-
-    def _bent(self) -> tuple[int, Float[Array, ""]]:
-        """How many arcs bound the opening, and their curvature; NaN if it is out of range."""
-        squeeze, roundness = self.squeeze, self.roundness
+        squeeze = self._valid_squeeze()
         if self.blades == 0:
-            arcs, curvature = _DISC_ARCS, jnp.ones_like(squeeze)
-        else:
-            arcs, curvature = self.blades, roundness
-        is_valid = (squeeze > 0) & (squeeze <= 1) & (curvature >= 0) & (curvature <= 1)
-        return arcs, jnp.where(is_valid, curvature, jnp.nan)
+            return math.pi * squeeze
+        half = math.sin(math.pi / self.blades)
+        triangle = math.sin(2 * math.pi / self.blades) / 2
+        if self.roundness is None:
+            return self.blades * triangle * squeeze
+        square = jnp.asarray(4 * half * half, self.roundness.dtype)
+        segment, _ = _segment(square, self.roundness, half)
+        return self.blades * (triangle + segment).astype(squeeze.dtype) * squeeze
+
+    def _valid_squeeze(self) -> Float[Array, ""]:
+        """NaN where it or the roundness is out of its range."""
+        is_valid = (self.squeeze > 0) & (self.squeeze <= 1)
+        if self.roundness is not None:
+            is_valid &= (self.roundness >= 0) & (self.roundness <= 1)
+        return jnp.where(is_valid, self.squeeze, jnp.nan)
 
 
 def points_of(
@@ -120,7 +120,8 @@ def points_of(
     And all the points, turned and squeezed with it: the derivative is exact in `rotation` and
     `squeeze`. `roundness` must be concrete.
     """
-    if not is_concrete(iris.roundness):
+    bend = 0.0 if iris.roundness is None else iris.roundness
+    if not is_concrete(bend):
         raise ValueError(
             "`accumulate(iris.roundness)` must be concrete, which says what points the iris "
             "holds, got a traced number."
@@ -128,7 +129,7 @@ def points_of(
     held = np.ones(len(unit), bool)
     half = math.sin(math.pi / max(iris.blades, 1))
     for k in range(iris.blades):
-        curvature, angle = float(iris.roundness), (2 * k + 1) * math.pi / iris.blades
+        curvature, angle = float(bend), (2 * k + 1) * math.pi / iris.blades
         normal = np.array([math.cos(angle), math.sin(angle)])
         away = unit - math.cos(math.pi / iris.blades) * normal
         bulge = curvature / 2 * ((away**2).sum(axis=1) - half**2)
@@ -139,11 +140,18 @@ def points_of(
     return held, jnp.stack(turned, axis=1)
 
 
-def check_iris(name: str, iris: Any) -> None:
-    """Raise `ValueError` unless `iris` is a single iris."""
+def check_iris(name: str, iris: Any) -> Iris:
+    """The iris, without a roundness that is known to be 0; `ValueError` unless it is one.
+
+    To a compiled program that is another type of argument: that of straight blades is quicker.
+    """
     if not isinstance(iris, Iris):
         raise ValueError(f"`{name}` must be an Iris, got {type(iris).__name__}.")
     check_fields(name, iris)
+    bend = iris.roundness
+    if iris.blades and not (bend is None or (is_concrete(bend) and float(bend) == 0)):
+        return iris
+    return eqx.tree_at(lambda iris: iris.roundness, iris, None)
 
 
 class Pieces(NamedTuple):
@@ -161,31 +169,37 @@ class Pieces(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """The outline of an iris: arcs between corners on the disc.
+    """The outline of an iris: a disc, or lines or arcs between corners on the disc.
 
-    - `pieces`: all of it without its squeeze, anticlockwise where y points up. Each arc is two
-      pieces, of which one is empty unless the arc holds its circle's highest or lowest point.
-    - `half`: half of the length of each arc's chord. `curvature`: that of each arc.
+    - `pieces`: all of it without its squeeze, anticlockwise where y points up; none for a disc.
+      Each arc is two pieces, of which one is empty unless the arc holds its circle's highest or
+      lowest point.
+    - `half`: half of the length of each line or arc's chord.
+    - `curvature`: that of each arc; none for lines.
     - `squeeze`: what x is finally multiplied by.
     """
 
-    pieces: Pieces
+    pieces: Pieces | None
     half: float
-    curvature: Float[Array, ""]
+    curvature: Float[Array, ""] | None
     squeeze: Float[Array, ""]
 
 
 def outline(iris: Iris, dtype: Any) -> Outline:
     """The pieces of an iris' outline, in `dtype`."""
     iris = jax.tree.map(lambda x: x.astype(dtype), iris)
-    arcs, curvature = iris._bent()
-    half, apothem = math.sin(math.pi / arcs), math.cos(math.pi / arcs)
+    squeeze, sides, curvature = iris._valid_squeeze(), iris.blades, iris.roundness
+    if sides == 0:
+        return Outline(None, 1.0, None, squeeze)
+    half, apothem = math.sin(math.pi / sides), math.cos(math.pi / sides)
     at = lambda angle: jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-    steps = jnp.arange(arcs, dtype=dtype) * (2 * math.pi / arcs)
+    steps = jnp.arange(sides, dtype=dtype) * (2 * math.pi / sides)
     first = at(iris.rotation + steps)
     last = jnp.roll(first, -1, axis=0)
-    normal = at(iris.rotation + steps + math.pi / arcs)
+    normal = at(iris.rotation + steps + math.pi / sides)
     middle = apothem * normal
+    if curvature is None:
+        return Outline(Pieces(first, last, middle, normal), half, None, squeeze)
 
     # The circle's highest or lowest point, if it is on the arc: there `_crossing` has one root.
     x, y = normal.T
@@ -195,11 +209,10 @@ def outline(iris: Iris, dtype: Any) -> Outline:
     rise = (bend * half**2 + facing**2 * x * x / bend) / (1 + facing * jnp.abs(y))
     extremum = middle + jnp.stack([-facing * x / bend, jnp.sign(y) * rise], axis=1)
     turn = jnp.where(turns[:, None], extremum, last)
-    both = lambda *parts: jnp.concatenate(parts)
-    pieces = Pieces(
-        both(first, turn), both(turn, last), both(middle, middle), both(normal, normal)
-    )
-    return Outline(pieces, half, curvature, iris.squeeze)
+    twice = lambda x: jnp.concatenate([x, x])
+    starts, ends = jnp.concatenate([first, turn]), jnp.concatenate([turn, last])
+    pieces = Pieces(starts, ends, twice(middle), twice(normal))
+    return Outline(pieces, half, curvature, squeeze)
 
 
 def _facing(curvature: Float[Array, ""], half: float) -> Float[Array, ""]:
@@ -211,7 +224,7 @@ def chord(
     outline: Outline,
     radius: Float[Array, "*shape"],
     side: Float[Array, "*shape"],
-    row: Num[Array, "#*shape"] | int,
+    row: Num[Array, ""] | int,
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Centre and half-width, in pixels, of the span that a sprite is in a row of pixels.
 
@@ -220,6 +233,8 @@ def chord(
     that of the disc, positive; `side` is 1 for a sprite as it is, -1 for one that is turned by
     half a turn.
     """
+    if outline.pieces is None:
+        return jnp.zeros_like(radius), outline.squeeze * row_half_width(radius, row)
     place = side * jnp.asarray(row, radius.dtype)
     low, high = (place - 0.5) / radius, (place + 0.5) / radius
     part = jax.vmap(lambda piece: _strip(outline, piece, low, high))
@@ -246,7 +261,12 @@ def _strip(
     x_bottom, x_top = (
         jnp.where(upward, *pair) for pair in ((x_start, x_end), (x_end, x_start))
     )
-    crossing = ft.partial(_crossing, outline, piece, upward)
+    if outline.curvature is None:
+        is_steep = top > bottom
+        run = jnp.where(is_steep, (x_top - x_bottom) / jnp.where(is_steep, top - bottom, 1), 0)
+        crossing = lambda height: x_bottom + run * (height - bottom)
+    else:
+        crossing = ft.partial(_crossing, outline.curvature, outline.half, piece, upward)
 
     def cut(height):
         """x and y of the piece there, or of its nearer end."""
@@ -257,23 +277,28 @@ def _strip(
 
     (x_low, y_low), (x_high, y_high) = cut(low), cut(high)
     rise = jnp.where(upward, 1, -1) * (y_high - y_low)
-    square = (x_high - x_low) ** 2 + (y_high - y_low) ** 2
-    segment, lever = _segment(square, outline.curvature)
     middle = (x_low + x_high) / 2
-    area = middle * rise + segment
+    area = middle * rise
     moment = (x_low * x_low + x_low * x_high + x_high * x_high) * rise / 6
-    return area, moment + segment * middle + lever * rise
+    if outline.curvature is None:
+        return area, moment
+    square = (x_high - x_low) ** 2 + (y_high - y_low) ** 2
+    segment, lever = _segment(square, outline.curvature, outline.half)
+    return area + segment, moment + segment * middle + lever * rise
 
 
 def _crossing(
-    outline: Outline, piece: Pieces, upward: Bool[Array, ""], height: Float[Array, "*shape"]
+    curvature: Float[Array, ""],
+    half: float,
+    piece: Pieces,
+    upward: Bool[Array, ""],
+    height: Float[Array, "*shape"],
 ) -> Float[Array, "*shape"]:
     """x of a piece at a height between those of its ends.
 
     From the midpoint of its chord, the arc is where `curvature / 2 * (u**2 + v**2 - half**2) +
     facing * (u, v) . normal` is 0: solved for u in the form that has no cancellation.
     """
-    curvature, half = outline.curvature, outline.half
     facing = _facing(curvature, half)
     v = height - piece.middle[1]
     side = jnp.where(upward, 1, -1).astype(v.dtype)
@@ -291,24 +316,19 @@ def _crossing(
 
 
 def _segment(
-    square: Float[Array, "*shape"], curvature: Float[Array, ""]
+    square: Float[Array, "*shape"], curvature: Float[Array, ""], half: float
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Area between a chord, of that squared length, and its arc; and how far out it lies.
 
     The second is the area's first moment along the chord's normal, over the chord's length.
+    `half` is half of the longest chord.
     """
     bent = curvature * curvature * square / 4  # The square of the sine of half the angle.
-    is_short = bent < _SHORT_ARC
-    long = jnp.where(is_short, 0.5, jnp.minimum(bent, 1 - jnp.finfo(bent.dtype).eps))
-    sine, cosine = jnp.sqrt(long), jnp.sqrt(1 - long)
-    area_long = (jnp.arcsin(sine) - sine * cosine) / (4 * sine * long)
-    short = jnp.where(is_short, bent, 0)
-    area_short = jnp.zeros_like(bent)
-    for coefficient in reversed(_segment_series(12)):
-        area_short = area_short * short + coefficient
-    area = jnp.where(is_short, area_short, area_long)
-    cosine = jnp.where(is_short, jnp.sqrt(1 - short), cosine)
-    lever = 1 / 12 - area * cosine / 2
+    is_single = square.dtype == jnp.float32
+    area, lever = (
+        ft.reduce(lambda sum_, coefficient: sum_ * bent + coefficient, reversed(polynomial))
+        for polynomial in _segment_polynomials(half, 1e-8 if is_single else 1e-17)
+    )
     there = square > 0
     length = jnp.sqrt(jnp.where(there, square, 1))
     cubic = jnp.where(there, square * length, 0)
@@ -316,11 +336,22 @@ def _segment(
 
 
 @ft.cache
-def _segment_series(terms: int) -> tuple[float, ...]:
-    """Of `(asin(s) - s sqrt(1 - s**2)) / (4 s**3)`, by powers of s**2."""
-    # asin(s) - s sqrt(1 - s**2) is the integral of 2 t**2 / sqrt(1 - t**2).
-    term, found = 1.0, []
-    for k in range(terms):
-        found.append(term / (2 * (2 * k + 3)))
-        term *= (2 * k + 1) / (2 * k + 2)
-    return tuple(found)
+def _segment_polynomials(half: float, error: float) -> tuple[tuple[float, ...], ...]:
+    """Of an arc of curvature 1 and chord `2 s`: `(asin(s) - s sqrt(1 - s**2)) / (4 s**3)`, and
+    `1 / 12` less half of that times `sqrt(1 - s**2)`; by powers of s**2, lowest first.
+
+    For `s` up to `half`, by Chebyshev fits. The nearest branch point is at 1, which says how
+    the error falls with the degree. `asin(s) - s sqrt(1 - s**2)` is the integral of
+    `2 t**2 / sqrt(1 - t**2)`, whose series is summed at the nodes.
+    """
+    away = 2 / half**2 - 1
+    degree = math.ceil(-math.log(error) / math.log(away + math.sqrt(away**2 - 1)))
+    nodes = half**2 / 2 * (1 - np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree)))
+    term, area = np.ones_like(nodes), np.zeros_like(nodes)
+    for k in range(400):
+        area += term / (2 * (2 * k + 3))
+        term *= nodes * (2 * k + 1) / (2 * k + 2)
+    lever = 1 / 12 - area * np.sqrt(1 - nodes) / 2
+    fit = ft.partial(np.polynomial.Chebyshev.fit, nodes, deg=degree, domain=(0, half**2))
+    plain = lambda series: series.convert(kind=np.polynomial.Polynomial)
+    return tuple(tuple(map(float, plain(fit(y)).coef)) for y in (area, lever))

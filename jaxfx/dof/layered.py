@@ -125,7 +125,7 @@ def layered(
         slices = math.ceil(max_coc / max(float(threshold), max_coc / SLICES))
     extent = Extent(max_coc, slices)
     if iris is not None:
-        check_iris("layered(iris=...)", iris)
+        iris = check_iris("layered(iris=...)", iris)
     return _layered(image, depth, lens, extent, second, threshold, iris)
 
 

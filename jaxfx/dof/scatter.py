@@ -141,7 +141,7 @@ def scatter(
             f"got {program!r}."
         )
     if iris is not None:
-        check_iris("scatter(iris=...)", iris)
+        iris = check_iris("scatter(iris=...)", iris)
         return _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program)
     if program == "auto":
         # From the data where they can be looked at, else from what they may hold; the programs
