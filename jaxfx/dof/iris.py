@@ -147,8 +147,9 @@ def check_iris(name: str, iris: Any) -> Iris:
     """
     if not isinstance(iris, Iris):
         raise ValueError(f"`{name}` must be an Iris, got {type(iris).__name__}.")
-    check_fields(name, iris)
     bend = iris.roundness
+    zero = eqx.tree_at(lambda x: x.roundness, iris, iris.squeeze, is_leaf=lambda x: x is None)
+    check_fields(name, iris if bend is not None else zero)
     if iris.blades and not (bend is None or (is_concrete(bend) and float(bend) == 0)):
         return iris
     return eqx.tree_at(lambda iris: iris.roundness, iris, None)

@@ -284,11 +284,13 @@ def _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program):
             '`scatter(iris=...)` must go with `program` "auto", "shift" or "spans", '
             f"got {program!r}."
         )
+    is_known = is_concrete(epsilon)
     if program == "auto":
-        program = "shift" if reach(max_coc) <= _FEW_ROWS else "spans"
-    far, near = reach(max_coc), None
+        is_small = reach(max_coc) <= _FEW_ROWS or not is_known
+        program = "shift" if is_small else "spans"
+    near = None
     if program == "spans":
-        near = near_reach(float(epsilon), max_coc) if is_concrete(epsilon) else far
+        near = near_reach(float(epsilon), max_coc) if is_known else reach(max_coc)
     return _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near)
 
 
