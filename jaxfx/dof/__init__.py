@@ -4,6 +4,7 @@
 |---|---|
 | the best result from one image and its depth | `layered` |
 | the same where a second layer of depth is known | `layered(behind=(image, depth))` |
+| blades, rounded blades or an anamorphic lens | `Iris`, of `scatter`, `layered`, `accumulate` |
 | a preview within 0.5 dB in a tenth of the time | `separable` |
 | a lens found from an image | `fit.dof`, through `layered` or `scatter` |
 | parameters fitted to a scene, second derivatives | `scatter` |

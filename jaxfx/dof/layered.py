@@ -109,7 +109,8 @@ def layered(
 
     Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
     the frame, where the last pixels are repeated. Within a slice nothing hides anything. The
-    parts of the lens that two edges hide are added up, even where they overlap.
+    parts of the lens that two edges hide are added up, even where they overlap. How much of
+    the lens sees a point of the second layer is that of a disc, whatever the iris.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is

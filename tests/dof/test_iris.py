@@ -191,6 +191,23 @@ def accumulated(depth, iris):
     return dof.accumulate(jax.jit(render), CAMERA, LENS, iris=iris, samples=400, jitter=False)
 
 
+def test_many_pinholes_have_the_slopes_of_rotation_and_squeeze():
+    def render(camera):
+        pixels = pixel_centers(4, 4, camera.intrinsics.dtype)
+        points = camera.unproject(pixels, jnp.full((4, 4), 3.4, pixels.dtype))
+        return jnp.sin(3 * points[..., :1]) * jnp.cos(2 * points[..., 1:2])
+
+    def loss(rotation, squeeze):
+        iris = Iris(3, rotation, 0.0, squeeze)
+        return jnp.sum(dof.accumulate(render, CAMERA, LENS, iris=iris, samples=6).image ** 2)
+
+    check_slopes(loss, (jnp.asarray(0.2), jnp.asarray(0.7)), atol=1e-6, rtol=1e-6, eps=1e-5)
+    with pytest.raises(ValueError, match=r"accumulate\(iris.roundness\)` must be concrete"):
+        jax.grad(lambda bend: dof.accumulate(render, CAMERA, LENS, iris=Iris(3, 0.0, bend)))(
+            0.1
+        )
+
+
 @pytest.mark.parametrize("depth", [3.4, 1.3])
 def test_scatter_shows_the_shape_that_many_pinholes_show(depth):
     iris, middle = Iris(3, rotation=0.4, squeeze=0.7), SIZE // 2
