@@ -110,7 +110,9 @@ def layered(
     Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
     the frame, where the last pixels are repeated. Within a slice nothing hides anything. The
     parts of the lens that two edges hide are added up, even where they overlap. How much of
-    the lens sees a point of the second layer is that of a disc, whatever the iris.
+    the lens sees a point of the second layer is that of a disc, whatever the iris. With an iris
+    and float32, a highlight of a million times its surroundings changes them by 2 % along its
+    rows, one of 5000 times by a millionth or two.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is
