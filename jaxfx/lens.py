@@ -5,6 +5,7 @@
 | a lens on a camera of the scene | `ThinLens.from_camera` |
 | a photographer's lens, focused by moving it | `ThinLens.from_physical` |
 | Blender's lens, or any whose sensor stays at the focal length | `ThinLens.from_sensor` |
+| strength and focus in a disparity, as most tools take them | `ThinLens.from_disparity` |
 | blurriness between three planes, as an artist sets it | `FocusPlanes` |
 | a lens of my own | any object with the three members of `Lens` |
 """
@@ -311,6 +312,68 @@ class ThinLens(eqx.Module):
         )
         width = whole_number("from_sensor(width)", width)
         return cls(focal_length / f_number, distance, focal_length / sensor_width * width)
+
+    @classmethod
+    def from_disparity(
+        cls, *, strength: Any, focus_disparity: Any, scale: Any = 1.0, shift: Any = 0.0
+    ) -> "ThinLens":
+        """A lens by the two numbers that go with a disparity, of a network or a stereo pair.
+
+        With `depth = depth.from_disparity(disparity, scale=scale, shift=shift)`, its defocus is
+        `strength * (focus_disparity - disparity)` pixels, whatever `scale` and `shift` are.
+
+        **Arguments:**
+
+        - `strength`: K, pixels of the circle of confusion's diameter per step of disparity.
+          Tools that state a radius, as BokehMe does, have half of it.
+        - `focus_disparity`: the disparity in focus, in its own unit, steps.
+        - `scale`, `shift`: inverse scene units of one step, and of a disparity of 0: those of
+          `depth.from_disparity`. Without a scale the depth is the inverse of the disparity.
+
+        **Returns:** the lens: `focus_distance` is `1 / (scale * focus_disparity + shift)`,
+        `aperture` is `strength / scale` and `focal_pixels` is 1, of which only the product with
+        the aperture counts. Back again, `strength` is `aperture * focal_pixels * scale` and
+        `focus_disparity` is `(1 / focus_distance - shift) / scale`.
+
+        **Raises:** `ValueError` for a negative strength, a scale that is not positive, or a
+        disparity in focus whose depth is negative. A focus at a disparity that stands for depth
+        inf is focus at infinity.
+
+        **Gradient:** exact; zero in `focus_disparity` and `shift` at infinity.
+
+        **Example:**
+
+        >>> import numpy as np
+        >>> from jaxfx import ThinLens, depth
+        >>> lens = ThinLens.from_disparity(strength=20.0, focus_disparity=0.75)
+        >>> disparity = np.array([[1.0, 0.75, 0.0]], np.float32)
+        >>> print(lens.defocus(depth.from_disparity(disparity, scale=1.0)))
+        [[-5.  0. 15.]]
+
+        No image tells `scale` and `shift` of a disparity from the lens: the defocus has
+        neither. `gamma` of `dof.scatter`, which reads depth itself, changes with `shift`.
+
+        Source: Peng et al. 2022 (BokehMe) and the tools after it, for the two numbers; the
+        algebra is that of the thin lens.
+        """
+        strength, scale = (
+            _finite(f"from_disparity({name}=...)", value, valid, expected)
+            for name, value, valid, expected in (
+                ("strength", strength, _not_negative, "0 or positive"),
+                ("scale", scale, _positive, "positive"),
+            )
+        )
+        name = "from_disparity(focus_disparity=...)"
+        focus_disparity = parameter(name, focus_disparity)
+        shift = parameter("from_disparity(shift=...)", shift)
+        inverse_depth = scale * focus_disparity + shift
+        expected = "at a depth (scale * focus_disparity + shift >= 0)"
+        check(name, inverse_depth, lambda v: (v >= 0) & np.isfinite(v), expected)
+        is_near = inverse_depth > 0
+        distance = jnp.where(is_near, 1 / jnp.where(is_near, inverse_depth, 1), jnp.inf)
+        # A disparity that is traced may turn out to have no depth: no lens has one either.
+        distance = jnp.where(inverse_depth < 0, jnp.nan, distance)
+        return cls(strength / scale, distance, jnp.ones_like(strength))
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
         """The lens' factor of the defocus, never negative, and the depth's, with the sign."""

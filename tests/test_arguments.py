@@ -277,11 +277,16 @@ CALLS = {
     ),
     "depth.fill": (depth.fill, {"depth": DEPTH, "image": IMAGE}),
     "ThinLens": (ThinLens, {"aperture": 0.1, "focus_distance": 2.0, "focal_pixels": 30.0}),
+    "ThinLens.from_disparity": (
+        ThinLens.from_disparity,
+        {"strength": 8.0, "focus_disparity": 0.5, "scale": 2.0, "shift": 0.1},
+    ),
     "ThinLens.defocus": (ft.partial(ThinLens.defocus, LENS), {"depth": DEPTH}),
     "ThinLens.circle_of_confusion": (
         ft.partial(ThinLens.circle_of_confusion, LENS),
         {"depth": DEPTH},
     ),
+    "dof.Iris": (dof.Iris, {"blades": 6, "rotation": 0.1, "roundness": 0.2, "squeeze": 0.9}),
     "FocusPlanes": (FocusPlanes, {"near": 1.0, "focus": 2.0, "far": 3.0, "max_coc": 4.0}),
     "PinholeCamera": (
         PinholeCamera,

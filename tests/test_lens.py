@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx import FocusPlanes, Lens, OrthographicCamera, PinholeCamera, ThinLens
+from jaxfx import (
+    FocusPlanes,
+    Lens,
+    OrthographicCamera,
+    PinholeCamera,
+    ThinLens,
+    depth as depths,
+    dof,
+)
 from tests.helpers.forms import first
 from tests.helpers.quick import check_slopes
 
@@ -73,6 +81,60 @@ def test_from_sensor_is_the_cone_of_rays_through_a_fixed_sensor():
         np.eye(4), lens=focal_length, sensor_width=sensor, height=1080, width=width
     )
     np.testing.assert_allclose(lens.focal_pixels, camera.intrinsics[0, 0], rtol=1e-12)
+
+
+@hyp.given(positive, st.floats(0, 1), positive, st.floats(0, 1))
+@hyp.settings(max_examples=30, deadline=None)
+def test_from_disparity_is_linear_in_disparity(strength, focus, scale, shift):
+    disparity = np.array([[0.0, 0.25, focus, 1.0]])
+    lens = ThinLens.from_disparity(
+        strength=strength, focus_disparity=focus, scale=scale, shift=shift
+    )
+    depth = depths.from_disparity(disparity, scale=scale, shift=shift)
+    tolerance = 1e-12 * strength * (1 + (1 + shift) / scale)
+    np.testing.assert_allclose(
+        lens.defocus(depth), strength * (focus - disparity), rtol=0, atol=tolerance
+    )
+    # And back again.
+    np.testing.assert_allclose(lens.aperture * lens.focal_pixels * scale, strength, rtol=1e-12)
+    back = (1 / lens.focus_distance - shift) / scale
+    np.testing.assert_allclose(back, focus, atol=1e-12 * (1 + (1 + shift) / scale))
+
+
+def test_from_disparity_of_a_lens_at_infinity_and_its_errors():
+    lens = ThinLens.from_disparity(strength=6.0, focus_disparity=0.0)
+    assert float(lens.focus_distance) == np.inf
+    np.testing.assert_allclose(lens.defocus(jnp.array([np.inf, 2.0])), [0.0, -3.0])
+    slopes = jax.grad(
+        lambda strength, focus: ThinLens.from_disparity(
+            strength=strength, focus_disparity=focus
+        ).defocus(jnp.array(2.0)),
+        (0, 1),
+    )(6.0, 0.0)
+    np.testing.assert_allclose(slopes, [-0.5, 0.0])
+    for wrong, named in (
+        ({"strength": -1.0}, "strength"),
+        ({"scale": 0.0}, "scale"),
+        ({"focus_disparity": -0.1}, "focus_disparity"),
+        ({"shift": -1.0}, "focus_disparity"),
+    ):
+        given = {"strength": 6.0, "focus_disparity": 0.5} | wrong
+        with pytest.raises(ValueError, match=rf"from_disparity\({named}=...\)"):
+            ThinLens.from_disparity(**given)
+
+
+def test_from_disparity_slopes_through_scatter():
+    rng = np.random.default_rng(0)
+    image, disparity = (jnp.asarray(rng.random(size)) for size in ((6, 7, 1), (6, 7)))
+
+    def loss(disparity, strength, focus):
+        lens = ThinLens.from_disparity(strength=strength, focus_disparity=focus)
+        depth = depths.from_disparity(disparity, scale=1.0)
+        return jnp.sum(dof.scatter(image, depth, lens, max_coc=6.0, program="shift") ** 2)
+
+    check_slopes(
+        loss, (disparity + 0.1, jnp.array(7.0), jnp.array(0.6)), atol=1e-5, rtol=1e-5, eps=1e-6
+    )
 
 
 @pytest.mark.parametrize(

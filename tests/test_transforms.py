@@ -59,6 +59,10 @@ def focus_planes(rng, size):
     return jaxfx.FocusPlanes(near=0.9, focus=rng.uniform(1.9, 2.1), far=4.5, max_coc=5.0)
 
 
+def iris(rng, size):
+    return jaxfx.dof.Iris(5, rng.uniform(0, 1), roundness=rng.uniform(0.3, 0.6), squeeze=0.8)
+
+
 def pinhole(rng, size):
     return jaxfx.PinholeCamera.from_fov(rng.uniform(0.9, 1.1), height=size[0], width=size[1])
 
@@ -168,6 +172,7 @@ EXAMPLES = {
     "camera": [pinhole, orthographic],
     "target": [pinhole, orthographic],
     "lens": [thin_lens, focus_planes],
+    "iris": [None, iris],
     "light": [point, ambient, directional, spot, harmonics, environment],
     "lights": [lambda rng, size: [make(rng, size) for make in (ambient, point)]],
     "gbuffers": [lambda rng, size: [gbuffer(rng, size), gbuffer(rng, size)]],
@@ -207,7 +212,8 @@ OWN_EXAMPLES = {
 # Choices that do not go together, which the function refuses by name.
 REFUSED = {
     "dof.scatter": lambda chosen: (
-        chosen["coverage"] == "indicator" and chosen["program"] != "segment_sum"
+        (chosen["coverage"] == "indicator" and chosen["program"] != "segment_sum")
+        or (chosen["iris"] is iris and chosen["program"] not in ("auto", "shift", "spans"))
     ),
     "shadow.edge_pcf": lambda chosen: (
         chosen["dilation"] is not EXAMPLES["dilation"][chosen["edges"] == "screen"]

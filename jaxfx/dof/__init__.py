@@ -4,6 +4,7 @@
 |---|---|
 | the best result from one image and its depth | `layered` |
 | the same where a second layer of depth is known | `layered(behind=(image, depth))` |
+| blades, rounded blades or an anamorphic lens | `Iris`, of `scatter`, `layered`, `accumulate` |
 | a preview within 0.5 dB in a tenth of the time | `separable` |
 | a lens found from an image | `fit.dof`, through `layered` or `scatter` |
 | parameters fitted to a scene, second derivatives | `scatter` |
@@ -19,6 +20,7 @@ from jaxfx.dof.blend import blend
 from jaxfx.dof.depth_sorted import depth_sorted
 from jaxfx.dof.diffusion import anisotropic_diffusion, implicit_diffusion
 from jaxfx.dof.gather import gather
+from jaxfx.dof.iris import Iris
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
 from jaxfx.dof.separable import separable
@@ -26,6 +28,7 @@ from jaxfx.dof.separable import separable
 
 __all__ = [
     "Accumulation",
+    "Iris",
     "accumulate",
     "anisotropic_diffusion",
     "blend",

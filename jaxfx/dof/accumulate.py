@@ -13,6 +13,7 @@ from jaxfx._checks import WholeNumber, check_image, parameter, whole_number
 from jaxfx._numerics import safe_sqrt, working_dtype
 from jaxfx._progress import counted
 from jaxfx.camera import PinholeCamera
+from jaxfx.dof.iris import Iris, check_iris, points_of
 from jaxfx.lens import ThinLens
 
 
@@ -35,6 +36,7 @@ def accumulate(
     lens: ThinLens,
     *,
     samples: WholeNumber = 256,
+    iris: Iris | None = None,
     jitter: bool = True,
     seed: WholeNumber = 0,
     progress: bool = False,
@@ -52,6 +54,8 @@ def accumulate(
     - `camera`: the pinhole camera at the lens' centre.
     - `lens`: its `aperture` and `focus_distance` are used, in scene units.
     - `samples`: static; how many passes.
+    - `iris`: the shape of the lens' opening; by default the disc. Its points are those of the
+      disc's sequence that lie in it.
     - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
       pixel.
     - `seed`: static; an integer from 0, turns the sequence to another of its kind.
@@ -61,10 +65,12 @@ def accumulate(
     (JAX's default for integers), summed in float32 at least; and `convergence`.
 
     **Raises:** `ValueError` where `samples` is not a positive integer, the lens is not a
-    `ThinLens`, or `render` returns no image, or images of different shapes.
+    `ThinLens`, `iris` is no `Iris`, or `render` returns no image, or images of different
+    shapes.
 
     **Gradient:** that of `render`, through its camera: exact in the aperture, the focus
-    distance and the camera where `render` is. A rasteriser's is zero or missing.
+    distance, the camera, and the iris' `rotation` and `squeeze`, where `render` is. A
+    rasteriser's is zero or missing. `roundness` must not be traced.
 
     **Example:**
 
@@ -88,6 +94,9 @@ def accumulate(
     seed = whole_number("accumulate(seed=...)", seed, lambda n: n >= 0, "an integer from 0")
 
     offsets, shifts = lens_samples(samples, seed)
+    if iris is not None:
+        check_iris("accumulate(iris=...)", iris)
+        offsets, shifts = iris_samples(iris, samples, seed)
     total = half = dtype = None
     for index in counted(range(samples), progress, "lens"):
         offset = lens.aperture * jnp.asarray(offsets[index], lens.aperture.dtype)
@@ -131,6 +140,17 @@ def lens_samples(
     u = (start + np.arange(samples)[:, None] * steps) % 1
     radius, angle = np.sqrt(u[:, 0]) / 2, 2 * np.pi * u[:, 1]
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1), u[:, 2:] - 0.5
+
+
+def iris_samples(
+    iris: Iris, samples: int, seed: int = 0
+) -> tuple[Float[Array, "samples 2"], Float[np.ndarray, "samples 2"]]:
+    """The same for an iris: the first points of the disc's sequence that lie in it."""
+    # The least share of the disc that an iris has: that of the triangle, 0.41.
+    offsets, shifts = lens_samples(4 * samples + 16, seed)
+    held, turned = points_of(iris, 2 * offsets)
+    chosen = np.flatnonzero(held)[:samples]
+    return turned[chosen] / 2, shifts[chosen]
 
 
 def _shifted(camera: PinholeCamera, shift: Float[np.ndarray, "2"]) -> PinholeCamera:

@@ -15,6 +15,8 @@ from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.arguments import check_arguments, compiled, defocused, with_own
+from jaxfx.dof.iris import Iris, check_iris, outline
+from jaxfx.dof.kernels import _layer_chords
 from jaxfx.dof.kernels._layers import composited
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets
 from jaxfx.dof.spoiled import spoiled
@@ -44,6 +46,7 @@ def layered(
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
+    iris: Iris | None = None,
 ) -> Float[Array, "height width channel"]:
     """Depth of field with occlusion: point sprites composited per pixel from front to back.
 
@@ -63,20 +66,22 @@ def layered(
       where it is missing.
     - `threshold`: pixels; how much the defocus changes from slice to slice. One default
       serves all scenes that were tried. Values below `max_coc / 128` are raised to that.
+    - `iris`: the shape of the sprites; by default the disc. The program is then another one,
+      the same on every device, and slower.
 
     **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
     number spoils what its sprite can reach. One whose depth is missing has no sprite: it shows
     what reaches it or, where nothing does, its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
-    `threshold`, or no `max_coc` under a transform.
+    `threshold`, an `iris` that is none, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
-    every field of `lens`, forward and reverse. In `lens` and `depth`, zero (but for rounding)
-    where a circle of confusion is below a pixel or above `max_coc`: a search cannot leave a
-    lens all of whose circles are so. There is no kink where neighbours have the same depth or a
-    surface is in focus. Kinks remain where a radius is clamped and where a lens is just filled:
-    the gradient there is that of one side.
+    every field of `lens` and `iris`, forward and reverse. In `lens` and `depth`, zero (but for
+    rounding) where a circle of confusion is below a pixel or above `max_coc`: a search cannot
+    leave a lens all of whose circles are so. There is no kink where neighbours have the same
+    depth or a surface is in focus. Kinks remain where a radius is clamped and where a lens is
+    just filled: the gradient there is that of one side.
 
     **Example:**
 
@@ -108,7 +113,10 @@ def layered(
 
     Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
     the frame, where the last pixels are repeated. Within a slice nothing hides anything. The
-    parts of the lens that two edges hide are added up, even where they overlap.
+    parts of the lens that two edges hide are added up, even where they overlap. How much of
+    the lens sees a point of the second layer is that of a disc, whatever the iris. With an iris
+    and float32, a highlight of a million times its surroundings changes them by 2 % along its
+    rows, one of 5000 times by a millionth or two.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is
@@ -123,7 +131,9 @@ def layered(
     if is_concrete(threshold):
         slices = math.ceil(max_coc / max(float(threshold), max_coc / SLICES))
     extent = Extent(max_coc, slices)
-    return _layered(image, depth, lens, extent, second, threshold)
+    if iris is not None:
+        iris = check_iris("layered(iris=...)", iris)
+    return _layered(image, depth, lens, extent, second, threshold, iris)
 
 
 def _second_layer(
@@ -144,12 +154,13 @@ def _second_layer(
 
 
 @ft.partial(jax.jit, static_argnames=("extent",))
-def _layered(image, depth, lens, extent, behind, threshold):
+def _layered(image, depth, lens, extent, behind, threshold, iris):
     max_coc = extent.max_coc
     view = defocused(image, depth, lens, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
+    area = math.pi if iris is None else iris.area().astype(view.image.dtype)
     through = jnp.where(view.missing, 0, jnp.ones_like(view.defocus))
-    layers = [_sheet(view.image, view.defocus, through, view.missing, threshold)]
+    layers = [_sheet(view.image, view.defocus, through, view.missing, threshold, area)]
     spoils = spoiled(view.bad, jnp.abs(view.defocus), max_coc) | view.lost
     if behind is not None:
         second = defocused(behind[0], behind[1], behind[2], max_coc)
@@ -161,13 +172,18 @@ def _layered(image, depth, lens, extent, behind, threshold):
         # A point less than one slice behind a surface belongs to that surface.
         apart = clip01((farther - view.defocus) / threshold - 1)
         through = jnp.where(is_second, clip01(seen / _SEEN) * apart, 0)
-        layers.append(_sheet(second.image, farther, through, view.missing, threshold))
+        layers.append(_sheet(second.image, farther, through, view.missing, threshold, area))
         spoils |= spoiled(second.bad, jnp.abs(second.defocus), max_coc)
     far = extent.reach
     # Beyond the frame the last pixels are repeated.
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(far, far)] * 2, mode="edge")
     sheets = jax.tree.map(lambda *planes: jnp.stack([pad(x) for x in planes]), *layers)
-    light, late = jnp.split(jnp.moveaxis(composited(extent, sheets), 0, -1), 2, axis=-1)
+    if iris is None:
+        sums = composited(extent, sheets)
+    else:
+        shape = outline(iris, view.image.dtype)
+        sums = _layer_chords.composited(extent, sheets, shape)
+    light, late = jnp.split(jnp.moveaxis(sums, 0, -1), 2, axis=-1)
     late = with_own(late, view.image, view.missing)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
     return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)
@@ -179,8 +195,12 @@ def _sheet(
     through: Float[Array, "height width"],
     missing: Bool[Array, "height width"],
     threshold: Float[Array, ""],
+    area: Float[Array, ""] | float,
 ) -> Sheets:
-    """The sprites of one layer, as `Sheets` without the axis of sheets."""
+    """The sprites of one layer, as `Sheets` without the axis of sheets.
+
+    `area` is that of a sprite of radius 1.
+    """
     half = jnp.abs(defocus) / 2
     radius = jnp.where(half < POINT_RADIUS, POINT_RADIUS, half)
     signed = jnp.where(defocus < 0, -2, 2) * radius
@@ -190,7 +210,7 @@ def _sheet(
     steep = square > most * most
     tilt = tilt * jnp.where(steep, most / jnp.sqrt(jnp.where(steep, square, 1)), 1)[None]
     value = jnp.concatenate([image, jnp.ones_like(image[..., :1])], axis=-1)
-    value = value * (through / (jnp.pi * radius * radius))[..., None]
+    value = value * (through / (area * radius * radius))[..., None]
     return Sheets(jnp.moveaxis(value, -1, 0), radius, tilt, defocus / threshold)
 
 

@@ -1,6 +1,7 @@
 """Depth of field by scattering every pixel over its circle of confusion."""
 
 import functools as ft
+import math
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
@@ -9,11 +10,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, check, option, parameter
+from jaxfx._checks import Number, check, is_concrete, option, parameter
 from jaxfx._meshes import on_any_mesh
 from jaxfx._platform import either
 from jaxfx.dof.arguments import check_arguments, largest_of, pixels, with_own
+from jaxfx.dof.iris import Iris, check_iris, outline
 from jaxfx.dof.kernels._adjoint import with_adjoint
+from jaxfx.dof.kernels._chords import Shaped, near_reach, painted, taps
 from jaxfx.dof.kernels._rows import ROWS
 from jaxfx.dof.kernels._segment_sum import COVERAGES, segment_sum
 from jaxfx.dof.kernels._spans import SPANS
@@ -53,6 +56,7 @@ def scatter(
     gamma: Float[ArrayLike, ""] | float = 0.0,
     epsilon: Float[ArrayLike, ""] | float = 2.0,
     max_coc: Number | None = None,
+    iris: Iris | None = None,
     program: Program = "auto",
     coverage: Coverage = "area",
 ) -> Float[Array, "height width channel"]:
@@ -72,6 +76,9 @@ def scatter(
     - `epsilon`: pixels; circles of confusion below it count as in focus.
     - `max_coc`: static; the largest diameter, in pixels. Larger sprites are clamped to it.
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from the data.
+    - `iris`: the shape of the sprites; by default the disc. It goes with the programs `"auto"`,
+      `"shift"` and `"spans"`, which then are others than for the disc, the same on every
+      device, and slower.
     - `program`: which program computes the sums; the result is the same. `"segment_sum"` writes
       every tap out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image
       an offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
@@ -88,14 +95,16 @@ def scatter(
     sprite: it shows what reaches it or, where nothing does, its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative `gamma` or
-    `epsilon`, an unknown option, or no `max_coc` under a transform.
+    `epsilon`, an unknown option, a program that does not take an iris, or no `max_coc` under a
+    transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
-    `lens`, silhouettes included, forward and reverse; again by `jax.jacfwd(jax.grad(loss))`,
-    which `jax.hessian` is. In `lens` and `depth`, zero where a circle of confusion is below a
-    pixel or above `max_coc`: a search cannot leave a lens all of whose circles are. At a kink
-    (the focus plane, the ends of both clamps) one of the two one-sided values. With
-    `coverage="indicator"` that of the coverage, almost everywhere zero, is missing.
+    `lens` and `iris`, silhouettes included, forward and reverse; again by
+    `jax.jacfwd(jax.grad(loss))`, which `jax.hessian` is. In `lens` and `depth`, zero where a
+    circle of confusion is below a pixel or above `max_coc`: a search cannot leave a lens all of
+    whose circles are. At a kink (the focus plane, the ends of both clamps) one of the two
+    one-sided values. With `coverage="indicator"` that of the coverage, almost everywhere zero,
+    is missing.
 
     **Example:**
 
@@ -133,6 +142,9 @@ def scatter(
             '`scatter(coverage="indicator")` must go with `program="segment_sum"`, '
             f"got {program!r}."
         )
+    if iris is not None:
+        iris = check_iris("scatter(iris=...)", iris)
+        return _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program)
     if program == "auto":
         # From the data where they can be looked at, else from what they may hold; the programs
         # themselves go no farther, tile by tile, than what they do hold.
@@ -153,8 +165,12 @@ def to_sprites(
     epsilon: Float[Array, ""],
     max_coc: int | float,
     missing: Bool[Array, "height width"],
+    area: Float[Array, ""] | float = math.pi,
 ) -> Sprites:
-    """The sprites of an image, in its type; none where the depth is missing."""
+    """The sprites of an image, in its type; none where the depth is missing.
+
+    `area` is that of a sprite of radius 1.
+    """
     dtype = image.dtype
     coc = lens.circle_of_confusion(depth)
     coc = jnp.where(coc < max_coc, coc, max_coc)
@@ -168,7 +184,7 @@ def to_sprites(
     visibility = jnp.exp(jnp.minimum(log_visibility, _LOG_VISIBILITY))
 
     one = jnp.ones_like(image[..., :1])
-    weight = visibility / (jnp.pi * radius * radius)
+    weight = visibility / (area * radius * radius)
     value = jnp.concatenate([image, one], axis=-1) * weight[..., None]
     value = jnp.where(missing[..., None], 0, value)
     epsilon = jnp.maximum(epsilon.astype(dtype), _SMALLEST_EPSILON)
@@ -255,5 +271,43 @@ def _scatter(image, depth, lens, gamma, epsilon, max_coc, programs, coverage):
     seen = pixels(image, depth, lens)
     operands = seen.image, seen.depth, lens, gamma, epsilon, seen.missing
     result = _in_or_out_of_focus(*operands, max_coc, programs, coverage)
+    spoils = spoiled(seen.bad, lens.circle_of_confusion(seen.depth), max_coc) | seen.lost
+    return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)
+
+
+# Up to this reach, in pixels, all taps are visited; beyond, spans are quicker on two cores.
+_FEW_ROWS = 4
+
+
+def _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program):
+    """`scatter` by sprites of another shape than the disc."""
+    if program not in ("auto", "shift", "spans"):
+        raise ValueError(
+            '`scatter(iris=...)` must go with `program` "auto", "shift" or "spans", '
+            f"got {program!r}."
+        )
+    is_known = is_concrete(epsilon)
+    if program == "auto":
+        is_small = reach(max_coc) <= _FEW_ROWS or not is_known
+        program = "shift" if is_small else "spans"
+    near = None
+    if program == "spans":
+        near = near_reach(float(epsilon), max_coc) if is_known else reach(max_coc)
+    return _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near)
+
+
+@ft.partial(jax.jit, static_argnames=("max_coc", "near"))
+def _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near):
+    """By `taps` or, where it is known how far those that stay taps go, by `painted`."""
+    seen = pixels(image, depth, lens)
+    dtype = seen.image.dtype
+    rematerialised = jax.checkpoint(to_sprites, static_argnums=5)
+    operands = seen.image, seen.depth, lens, gamma, epsilon, max_coc, seen.missing
+    sprites = rematerialised(*operands, iris.area().astype(dtype))
+    side = jnp.where(lens.defocus(seen.depth) < 0, -1, 1).astype(dtype)
+    shaped = Shaped(sprites, side, outline(iris, dtype))
+    far = reach(max_coc)
+    sums = taps(shaped, far) if near is None else painted(shaped, far, near)
+    result = _quotient(with_own(sums, seen.image, seen.missing))
     spoils = spoiled(seen.bad, lens.circle_of_confusion(seen.depth), max_coc) | seen.lost
     return jnp.where(spoils[..., None], jnp.nan, result).astype(image.dtype)

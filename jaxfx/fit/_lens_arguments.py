@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_lens
 from jaxfx._checks import check, check_depth, check_image, check_shape, items, option, parameter
+from jaxfx.dof.iris import Iris
 from jaxfx.dof.sprites import POINT_RADIUS
-from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Images, Values
+from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Images, Values
 from jaxfx.fit._lens_residual import Tone
 from jaxfx.lens import ThinLens
 
@@ -124,7 +125,12 @@ def _weights(weights: Any, image: Array) -> Float[Array, "height width"]:
 
 
 def start(
-    lenses: tuple[ThinLens, ...], gamma: Any, epsilon: Any, threshold: Any, dtype: DTypeLike
+    lenses: tuple[ThinLens, ...],
+    iris: Iris | None,
+    gamma: Any,
+    epsilon: Any,
+    threshold: Any,
+    dtype: DTypeLike,
 ) -> Values:
     """All parameters where the search starts, checked, in one type."""
     numbers = {
@@ -136,6 +142,8 @@ def start(
         check(f"dof({name}=...)", value, lambda v: v >= 0, "0 or positive")
     start = {name: jnp.stack([getattr(lens, name) for lens in lenses]) for name in LENS}
     start |= numbers | {"scale": jnp.ones(()), "shift": jnp.zeros(())}
+    if iris is not None:
+        start |= {name: getattr(iris, name) for name in IRIS}
     return {name: value.astype(dtype) for name, value in start.items()} | {
         "footprint": jnp.zeros((), dtype)
     }
@@ -167,10 +175,17 @@ def check_moves(
         )
 
 
-def names(effect: Effect, parameters: Collection[str] | None) -> tuple[str, ...]:
-    """The names of the parameters to fit, in the order of `PARAMETERS` and `DISPARITY`."""
+def names(
+    effect: Effect, parameters: Collection[str] | None, iris: Iris | None
+) -> tuple[str, ...]:
+    """The names of the parameters to fit: of `PARAMETERS`, `DISPARITY` and an iris' `IRIS`.
+
+    A disc has no rotation.
+    """
     default = PARAMETERS[effect]
     choices = default + DISPARITY
+    if iris is not None:
+        choices += IRIS if iris.blades else IRIS[1:]
     wanted = default if parameters is None else parameters
     names = tuple(name for name in choices if name in wanted)
     if not names or len(names) != len(wanted):

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx.dof.iris import Iris
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
 from jaxfx.dof.sprites import POINT_RADIUS, coverage, reach, row_half_width
@@ -28,6 +29,8 @@ Values = dict[str, Array]
 # inverse is `scale` times the inverse of the given depth, plus `shift`.
 LENS = ("aperture", "focus_distance")
 DISPARITY = ("scale", "shift")
+# Those of the iris, which all photographs share.
+IRIS = ("rotation", "squeeze")
 
 # The least start of a parameter that is sought by its logarithm, in that parameter's unit: a
 # start of 0 has no logarithm. A larger bound would move starts that are small on purpose.
@@ -76,6 +79,7 @@ class Model(eqx.Module):
 
     - `start`: all parameters; those of `LENS` have an entry for each photograph.
     - `corrects`: 1 where the footprint is free, 0 where it is held at 0.
+    - `iris`: the shape of the lens, whose numbers are those of the values; None for the disc.
     - `names`: the parameters that are sought.
     - `max_coc`: the largest circle of confusion that is drawn, in pixels.
     """
@@ -83,6 +87,7 @@ class Model(eqx.Module):
     images: Images
     start: Values
     corrects: Float[Array, ""]
+    iris: Iris | None
     names: tuple[str, ...] = eqx.field(static=True)
     effect: Effect = eqx.field(static=True)
     max_coc: int | float = eqx.field(static=True)
@@ -93,7 +98,8 @@ class Model(eqx.Module):
         An unknown is the logarithm of the parameter over its start. That of `gamma`, which may
         come to 0, adds to the inverse softplus of the start; that of `shift`, which has either
         sign, counts in medians of the inverse depth; that of `footprint` goes through a
-        hyperbolic tangent, which keeps it between -0.5 and 1.5.
+        hyperbolic tangent, which keeps it between -0.5 and 1.5; that of `rotation` is added;
+        a `squeeze` ends at 1.
         """
         values = dict(self.start)
         for name, unknown in unknowns.items():
@@ -104,6 +110,10 @@ class Model(eqx.Module):
                 value = jax.nn.softplus(base + unknown)
             elif name == "shift":
                 value = start + unknown * self._median_inverse_depth().astype(float)
+            elif name == "rotation":
+                value = start + unknown
+            elif name == "squeeze":
+                value = jnp.minimum(positive * jnp.exp(unknown), 1)
             elif name == "footprint":
                 value = self.corrects * (0.5 + jnp.tanh(unknown - math.atanh(0.5)))
             else:
@@ -139,6 +149,13 @@ class Model(eqx.Module):
         aperture, focus_distance = (values[name][photograph] for name in LENS)
         return ThinLens(aperture, focus_distance, self.images.focal_pixels[photograph])
 
+    def shape(self, values: Values) -> Iris | None:
+        """The iris with these numbers."""
+        if self.iris is None:
+            return None
+        numbers = tuple(values[name] for name in IRIS)
+        return eqx.tree_at(lambda iris: (iris.rotation, iris.squeeze), self.iris, numbers)
+
     def circles(self, values: Values) -> Float[Array, "photograph height width"]:
         """The circles of confusion in pixels, 0 where the depth is missing."""
         depth, _ = self.depths(values)
@@ -151,6 +168,8 @@ class Model(eqx.Module):
         """The images that the effect draws, footprint included."""
         depth, behind = self.depths(values)
 
+        iris = self.shape(values)
+
         def draw(aperture, focus_distance, focal_pixels):
             image = self.images.image
             lens = ThinLens(aperture, focus_distance, focal_pixels)
@@ -162,6 +181,7 @@ class Model(eqx.Module):
                     gamma=values["gamma"],
                     epsilon=values["epsilon"],
                     max_coc=self.max_coc,
+                    iris=iris,
                 )
             else:
                 drawn = layered(
@@ -171,6 +191,7 @@ class Model(eqx.Module):
                     behind=behind,
                     threshold=values["threshold"],
                     max_coc=self.max_coc,
+                    iris=iris,
                 )
             if "footprint" not in self.names:
                 return drawn

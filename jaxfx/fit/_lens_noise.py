@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxfx.dof.spoiled import spoiled
-from jaxfx.fit._lens_model import DISPARITY, LENS, Model, Values
+from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Model, Values
 from jaxfx.fit._lens_residual import Residual, evaluate
 
 
@@ -56,7 +56,7 @@ def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
     their own.
     """
     difference, drawn, *_ = evaluate(residual, unknowns)
-    names = [name for name in unknowns if name in LENS + DISPARITY]
+    names = [name for name in unknowns if name in LENS + DISPARITY + IRIS]
     sensitivity = jnp.zeros_like(drawn)
     for name in names or [name for name in unknowns if name != "footprint"]:
         nudged = unknowns | {name: unknowns[name] + _NUDGE}

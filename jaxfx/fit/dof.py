@@ -16,10 +16,11 @@ from jaxtyping import Array, Float, Num
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._progress import Bar
+from jaxfx.dof.iris import Iris, check_iris
 from jaxfx.fit import _lens_arguments as read
 from jaxfx.fit._descent import End, Solver, check_success, descend
 from jaxfx.fit._jackknife import covariance, tiles
-from jaxfx.fit._lens_model import DISPARITY, LENS, Effect, Model, Values
+from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Model, Values
 from jaxfx.fit._lens_noise import STRATA, strata
 from jaxfx.fit._lens_residual import Residual, Tone, evaluate, plain, report
 from jaxfx.fit._lens_search import Search
@@ -61,6 +62,7 @@ class DofFit(eqx.Module):
       pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
       larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
+    - `iris`: the shape with the numbers found; None where none was given.
     - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
     """
 
@@ -79,6 +81,7 @@ class DofFit(eqx.Module):
     standard_errors: dict[str, Float[Array, "*photograph"]]
     explained: Float[Array, ""]
     clamped: Float[Array, ""]
+    iris: Iris | None
     result: optx.RESULTS
 
     @property
@@ -103,6 +106,10 @@ class DofFit(eqx.Module):
         if name == "shift":  # It may well be 0: beside the inverse focus distance.
             distances = [np.asarray(lens.focus_distance, float) for lens in self.lenses]
             size = 1 / np.min(distances)
+        elif name == "rotation":  # It may be 0 too: beside the angle between blades.
+            size = 2 * math.pi / self.iris.blades if self.iris else 0.0
+        elif name == "squeeze":
+            size = np.asarray(self.iris.squeeze, float) if self.iris else 0.0
         elif name in LENS:
             size = np.array([np.asarray(getattr(lens, name), float) for lens in self.lenses])
         else:
@@ -116,7 +123,7 @@ class DofFit(eqx.Module):
             return str(self.result)
         if not self.explained > _LEAST_EXPLAINED:
             return f"Only {100 * float(self.explained):.0f} % of the contrast is explained."
-        untold = [name for name in self.untold if name in LENS + DISPARITY]
+        untold = [name for name in self.untold if name in LENS + DISPARITY + IRIS]
         if untold:
             return f"The images do not determine {' and '.join(untold)}."
         return ""
@@ -140,6 +147,7 @@ def dof(
     threshold: Float[ArrayLike, ""] | float = 2.0,
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
     | None = None,
+    iris: Iris | None = None,
     max_coc: Number | None = None,
     weights: Num[ArrayLike, "height width"] | None = None,
     loss: read.Loss = "robust",
@@ -168,6 +176,9 @@ def dof(
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
     - `behind`: the second layer, as in `dof.layered`.
+    - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
+      may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
+      quarter of the angle between blades and at less than 1. Its roundness is never fitted.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
@@ -221,8 +232,9 @@ def dof(
     images, lenses = read.images(reference, image, depth, lens, behind, weights)
     read.options(effect=effect, loss=loss, tone=tone, exposure=exposure)
     max_steps = whole_number("dof(max_steps=...)", max_steps)
-    start = read.start(lenses, gamma, epsilon, threshold, images.image.dtype)
-    names = read.names(effect, parameters)
+    iris = None if iris is None else check_iris("dof(iris=...)", iris)
+    start = read.start(lenses, iris, gamma, epsilon, threshold, images.image.dtype)
+    names = read.names(effect, parameters, iris)
     if max_coc is not None:
         is_diameter = lambda x: 0 < x < math.inf
         max_coc = number("dof(max_coc=...)", max_coc, is_diameter, "positive and finite")
@@ -230,9 +242,10 @@ def dof(
     is_robust, is_free = loss == "robust", exposure == "free"
     if is_robust:
         images = read.without_saturated(images)
-    if is_robust and {*LENS, *DISPARITY}.intersection(names):
+    # The footprint knows what the sprites of discs lack.
+    if is_robust and iris is None and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
-    model = Model(images, start, jnp.zeros(()), names, effect, 1.0)
+    model = Model(images, start, jnp.zeros(()), iris, names, effect, 1.0)
     with Bar(progress, "fit") as bar:
         solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         residual = functools.partial(plain, exposure=is_free, tone=tone)
@@ -272,6 +285,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
         standard_errors=standard_errors,
         explained=jnp.where(contrast > 0, 1 - jnp.mean(rest**2) / contrast, 1) * share,
         clamped=jnp.mean(model.circles(values) > model.max_coc),
+        iris=model.shape(values),
         result=end.result,
         **{name: values[name] for name in names},
     )
@@ -292,6 +306,6 @@ def _variances(residual: Residual, unknowns: Values, columns: Array, rest: Array
         circles = residual.model.circles(residual.model.values(unknowns))
         stratum = strata(circles, residual.scale, rest.shape[3])
         bias = tree(jnp.diagonal(covariance(columns, flat, stratum, 2 * STRATA)))
-        for name in {*LENS, *DISPARITY}.intersection(variances):
+        for name in {*LENS, *DISPARITY, *IRIS}.intersection(variances):
             variances[name] = variances[name] + bias[name]
     return variances

@@ -7,11 +7,13 @@
 | `_tiles` | the same tile by tile, only as far as each tile's sprites reach |
 | `_spans` | discs painted by running sums along rows: for large radii |
 | `_rows` | for accelerators: all taps of a row in one kernel |
+| `_chords` | sprites of the shape of an iris, by taps and by running sums, on any device |
 | `_segment_sum` | every tap written out: the oracle |
 | `_paint` | steps of spans scattered block by block, and the adjoint of that |
 | `_slices` | the layers of `layered`, cut into slices of defocus and painted by spans |
 | `_compositing` | slices composited from front to back, and the adjoint of that |
 | `_layer_rows` | for accelerators: slices in groups, all taps of a row in one kernel |
+| `_layer_chords` | slices of sprites of the shape of an iris, on any device |
 | `_layers` | `layered`'s sums: the two programs of it, and its tangent and adjoint |
 | `_adjoint` | a kernel with an adjoint of its own, as a function that JAX can transform |
 
