@@ -167,7 +167,7 @@ def dof(
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
-    - `behind`: the second layer, as in `dof.layered`.
+    - `behind`: the second layer, as in `dof.layered`; None fits through a single one.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
