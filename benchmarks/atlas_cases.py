@@ -156,7 +156,8 @@ def depth_of_field(at: Point) -> Case:
         "scatter": {"auto": of(dof.scatter), "gamma 1": of(dof.scatter, gamma=1.0)},
         **{f"scatter, {name}": {"": of(dof.scatter, program=name)} for name in programs},
         "layered": {
-            "1 layer": of(dof.layered),
+            "1 layer": of(dof.layered, behind=None),
+            "1 layer, 1 guessed": of(dof.layered),
             "2 layers": lambda image, depth, lens, behind: dof.layered(
                 image, depth, lens, max_coc=coc, behind=behind
             ),

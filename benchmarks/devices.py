@@ -73,7 +73,7 @@ def depth_of_field(side):
     for radius in (8, 32):
         data, room = _discs(side, radius), 2.0 * radius
         scatter = lambda *data, room=room: dof.scatter(*data, gamma=2.0, max_coc=room)
-        layered = lambda *data, room=room: dof.layered(*data, max_coc=room)
+        layered = lambda *data, room=room: dof.layered(*data, max_coc=room, behind=None)
         taps = TAP * side**2 * (2 * radius + 1) ** 2
         rows[f"scatter, radius {radius}"] = Row(scatter, data, taps)
         rows[f"scatter, gradient, radius {radius}"] = Row(squared(scatter), data, 3 * taps)

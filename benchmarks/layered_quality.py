@@ -81,7 +81,7 @@ def rows(case):
             score(scatter(*data, gamma=gamma, epsilon=epsilon))
             for gamma, epsilon in itertools.product(GAMMAS, EPSILONS)
         )
-        one = score(dof.layered(*data, max_coc=room))
+        one = score(dof.layered(*data, max_coc=room, behind=None))
         two = score(dof.layered(*data, max_coc=room, behind=case.behind))
         yield name, largest, np.array([scattered, one, two])
 

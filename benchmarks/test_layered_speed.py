@@ -16,7 +16,7 @@ from jaxfx import ThinLens, dof
 
 METHODS = {
     "scatter, auto": functools.partial(dof.scatter, gamma=2.0, epsilon=2.0),
-    "one layer": dof.layered,
+    "one layer": functools.partial(dof.layered, behind=None),
     "two layers": dof.layered,
 }
 

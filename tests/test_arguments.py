@@ -93,6 +93,7 @@ CALLS = {
     "metrics.ssim": (metrics.ssim, {"image": IMAGE, "reference": IMAGE / 2, "data_range": 1.0}),
     "dof.scatter": (dof.scatter, BLUR | {"gamma": 0.5, "epsilon": 1.0}),
     "dof.layered": (dof.layered, BLUR | {"threshold": 2.0}),
+    "dof.peel": (dof.peel, BLUR | {"threshold": 2.0}),
     "dof.gather": (dof.gather, BLUR | {"taps": 5, "ramp": 1.0}),
     "dof.blend": (dof.blend, BLUR),
     "dof.depth_sorted": (dof.depth_sorted, BLUR | {"slices": 3}),

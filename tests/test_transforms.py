@@ -189,7 +189,11 @@ EXAMPLES = {
     "slices": [lambda rng, size: 3, lambda rng, size: "all"],
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],
-    "behind": [lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size))],
+    "behind": [
+        lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size)),
+        "peel",
+        None,
+    ],
     "disparity": [lambda rng, size: rng.uniform(1.1, 4, size)],
     "distance": [lambda rng, size: rng.uniform(1.1, 4, size)],
     "scale": [lambda rng, size: np.array(rng.uniform(1, 2))],

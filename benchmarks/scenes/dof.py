@@ -22,7 +22,8 @@ COLUMNS = np.arange(SIZE) + 0.5 - MIDDLE
 
 def methods() -> dict[str, Callable[..., Any]]:
     """Every method of `dof` that takes an image, its depth and a lens."""
-    named = {name: getattr(dof, name) for name in dof.__all__}
+    # `peel` gives a second layer, no picture.
+    named = {name: getattr(dof, name) for name in dof.__all__ if name != "peel"}
     return {
         name: method
         for name, method in named.items()

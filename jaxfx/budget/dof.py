@@ -102,7 +102,7 @@ def dof(
     - `lens`: gives each depth its signed defocus, in pixels.
     - `max_error`: root mean square, linear image units, over all pixels and channels.
     - `effect`: the effect to replace: `dof.scatter` with `gamma=0`, `epsilon=2` and exact
-      programs, or `dof.layered`, from one layer.
+      programs, or `dof.layered`, from one image.
 
     **Returns:** a `Plan`, to be called with `image, depth, lens`, of this scene or of others
     with no larger circles: those are drawn as large as this scene's largest.

@@ -4,6 +4,7 @@
 |---|---|
 | the best result from one image and its depth | `layered` |
 | the same where a second layer of depth is known | `layered(behind=(image, depth))` |
+| a guess of that layer, from the picture itself | `peel` |
 | blades, rounded blades or an anamorphic lens | `Iris`, of `scatter`, `layered`, `accumulate` |
 | a preview within 0.5 dB in a tenth of the time | `separable` |
 | a lens found from an image | `fit.dof`, through `layered` or `scatter` |
@@ -12,7 +13,8 @@
 | methods of the literature, for comparison | `gather`, `blend`, `depth_sorted`, |
 | | `anisotropic_diffusion`, `implicit_diffusion` |
 
-All but `accumulate` are called with `(image, depth, lens, max_coc=...)` and give an image.
+All but `accumulate` are called with `(image, depth, lens, max_coc=...)` and give an image,
+`peel` an image and its depth.
 """
 
 from jaxfx.dof.accumulate import Accumulation, accumulate
@@ -22,6 +24,7 @@ from jaxfx.dof.diffusion import anisotropic_diffusion, implicit_diffusion
 from jaxfx.dof.gather import gather
 from jaxfx.dof.iris import Iris
 from jaxfx.dof.layered import layered
+from jaxfx.dof.peel import peel
 from jaxfx.dof.scatter import scatter
 from jaxfx.dof.separable import separable
 
@@ -36,6 +39,7 @@ __all__ = [
     "gather",
     "implicit_diffusion",
     "layered",
+    "peel",
     "scatter",
     "separable",
 ]

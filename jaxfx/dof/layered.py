@@ -2,14 +2,23 @@
 
 import functools as ft
 import math
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, check, check_depth, check_image, is_concrete, items, parameter
+from jaxfx._checks import (
+    Number,
+    check,
+    check_depth,
+    check_image,
+    is_concrete,
+    items,
+    option,
+    parameter,
+)
 from jaxfx._loops import scan
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01
@@ -19,6 +28,7 @@ from jaxfx.dof.iris import Iris, check_iris, outline
 from jaxfx.dof.kernels import _layer_chords
 from jaxfx.dof.kernels._layers import composited
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets
+from jaxfx.dof.peel import peel
 from jaxfx.dof.spoiled import spoiled
 from jaxfx.dof.sprites import POINT_RADIUS
 from jaxfx.lens import Lens
@@ -44,14 +54,16 @@ def layered(
     *,
     max_coc: Number | None = None,
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
-    | None = None,
+    | Literal["peel"]
+    | None = "peel",
     threshold: Float[ArrayLike, ""] | float = 2.0,
     iris: Iris | None = None,
 ) -> Float[Array, "height width channel"]:
     """Depth of field with occlusion: point sprites composited per pixel from front to back.
 
     It is the most accurate method from one image, needs no `gamma`, and takes a second layer of
-    depth where there is one. Time is 2.4 to 3.3 times that of `scatter`.
+    depth where there is one; else it guesses one. Time is 2.4 to 3.3 times that of `scatter`
+    for a single layer, and about twice as much for two.
 
     **Arguments:**
 
@@ -63,7 +75,7 @@ def layered(
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from `depth`.
     - `behind`: the image and depth of the next surface that faces the camera behind the first,
       shaped as `image` and `depth`; its depth is inf where there is none, or as in `depth`
-      where it is missing.
+      where it is missing. `"peel"` guesses it by `dof.peel`; None takes a single layer.
     - `threshold`: pixels; how much the defocus changes from slice to slice. One default
       serves all scenes that were tried. Values below `max_coc / 128` are raised to that.
     - `iris`: the shape of the sprites; by default the disc. The program is then another one,
@@ -77,11 +89,12 @@ def layered(
     `threshold`, an `iris` that is none, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, both of `behind`, `threshold` and
-    every field of `lens` and `iris`, forward and reverse. In `lens` and `depth`, zero (but for
-    rounding) where a circle of confusion is below a pixel or above `max_coc`: a search cannot
-    leave a lens all of whose circles are so. There is no kink where neighbours have the same
-    depth or a surface is in focus. Kinks remain where a radius is clamped and where a lens is
-    just filled: the gradient there is that of one side.
+    every field of `lens` and `iris`, forward and reverse; of a guessed layer, which pixels it
+    repeats is constant. In `lens` and `depth`, zero (but for rounding) where a circle of
+    confusion is below a pixel or above `max_coc`: a search cannot leave a lens all of whose
+    circles are so. There is no kink where neighbours have the same depth or a surface is in
+    focus. Kinks remain where a radius is clamped and where a lens is just filled: the gradient
+    there is that of one side.
 
     **Example:**
 
@@ -111,12 +124,15 @@ def layered(
     A point less than one slice behind is taken to be of the surface that hides it, and one of
     two slices or more behind to be of another surface. In between the share rises linearly.
 
+    A guessed second layer repeats pixels from next to an edge. On 18 pictures of three scenes,
+    those that `peel` was made on, it gains 1.05 dB on average and loses nothing.
+
     Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
     the frame, where the last pixels are repeated. Within a slice nothing hides anything. The
-    parts of the lens that two edges hide are added up, even where they overlap. How much of
-    the lens sees a point of the second layer is that of a disc, whatever the iris. With an iris
-    and float32, a highlight of a million times its surroundings changes them by 2 % along its
-    rows, one of 5000 times by a millionth or two.
+    parts of the lens that two edges hide are added up, even where they overlap. How much of the
+    lens sees a point of the second layer is that of a disc, whatever the iris. With an iris and
+    float32, a highlight of a hundred million times its surroundings changes them by 2 % along
+    its rows, one of 5000 times by a millionth or two.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is
@@ -126,6 +142,9 @@ def layered(
     image, depth, lens, max_coc = check_arguments("layered", image, depth, own, max_coc)
     threshold = parameter("layered(threshold=...)", threshold)
     check("layered(threshold=...)", threshold, lambda v: v >= 0, "0 or positive")
+    if isinstance(behind, str):
+        option("layered(behind=...)", behind, ("peel",))
+        behind = peel(image, depth, own, max_coc=max_coc, threshold=threshold)
     second = None if behind is None else _second_layer(image, depth, own, behind)
     slices = None
     if is_concrete(threshold):

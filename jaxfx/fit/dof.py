@@ -175,7 +175,7 @@ def dof(
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
-    - `behind`: the second layer, as in `dof.layered`.
+    - `behind`: the second layer, as in `dof.layered`; None fits through a single one.
     - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
       may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.

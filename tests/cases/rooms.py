@@ -43,15 +43,15 @@ def seen(
     camera = PinholeCamera.from_fov(fov, height=size[0], width=size[1], world_from_camera=pose)
     inverse = np.linalg.inv(np.asarray(camera.intrinsics, float))
     colors = [
-        _cast(place, pose, inverse, size, ((i + 0.5) / samples, (j + 0.5) / samples))[0]
+        cast(place, pose, inverse, size, ((i + 0.5) / samples, (j + 0.5) / samples))[0]
         for i in range(samples)
         for j in range(samples)
     ]
-    depth = _cast(place, pose, inverse, size, (0.5, 0.5))[1]
+    depth = cast(place, pose, inverse, size, (0.5, 0.5))[1]
     return np.mean(colors, axis=0).astype(np.float32), depth.astype(np.float32), camera
 
 
-def _cast(place, pose, inverse, size, at):
+def cast(place, pose, inverse, size, at):
     """Color and depth along the axis, of the first box that a ray meets, by slabs."""
     y, x = np.indices(size)
     pixels = np.stack([x + at[0], y + at[1], np.ones(size)], axis=-1)

@@ -322,7 +322,7 @@ def test_a_lens_that_hides_what_is_traced_asks_for_max_coc():
 
 PUBLIC = [
     *(dof.scatter, dof.layered, dof.depth_sorted, dof.gather, dof.blend, dof.separable),
-    *(dof.anisotropic_diffusion, dof.implicit_diffusion),
+    *(dof.anisotropic_diffusion, dof.implicit_diffusion, dof.peel),
 ]
 
 

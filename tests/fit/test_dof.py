@@ -94,7 +94,7 @@ def test_recovers_what_made_the_picture(sides, dtype):
 def test_the_threshold_of_layered_scatter_is_found():
     image, depth = still_life(16)
     lens = lambda factor: ThinLens(factor * 0.12, 3.0 / factor, 40.0)
-    draw = functools.partial(dof.layered, image, depth, max_coc=4.0)
+    draw = functools.partial(dof.layered, image, depth, max_coc=4.0, behind=None)
     fitted = fit.dof(
         *(draw(lens(1.0), threshold=1.2), image, depth, lens(0.95)),
         effect="layered",

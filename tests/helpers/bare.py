@@ -49,7 +49,7 @@ receivers = shadow.receivers(depth, camera, camera)
 wide = np.tile(image, (2, 2, 1))
 DEPTH_OF_FIELD = (
     *("dof.scatter", "dof.layered", "dof.gather", "dof.blend", "dof.depth_sorted"),
-    *("dof.anisotropic_diffusion", "dof.implicit_diffusion", "dof.separable"),
+    *("dof.anisotropic_diffusion", "dof.implicit_diffusion", "dof.separable", "dof.peel"),
 )
 
 
