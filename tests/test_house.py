@@ -26,7 +26,7 @@ NUMERICS = {
     "_platform",
     *("_loops", "_meshes", "_progress", "_pyramid", "_sampling", "_tiles"),
 }
-TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "transfer"}
+TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "sharding", "transfer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}
