@@ -10,6 +10,7 @@ import json
 import re
 import sys
 import traceback
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -193,7 +194,40 @@ def memory(count, side=8192):
     return {name: getattr(found, f"{name}_size_in_bytes") for name in names}
 
 
-CHECKS = {"memory": memory, "batch": batch, "rows": rows, "target_rows": target_rows}
+def page():
+    """What the page on many devices computes, block by block."""
+    text = (Path(__file__).parents[2] / "docs" / "devices.md").read_text(encoding="utf-8")
+    names: dict = {}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), names)
+    step, frames, lens = names["step"], names["frames"], names["lens"]
+    single = jax.tree.map(np.asarray, frames)
+    losses = lambda lens: jax.vmap(names["loss"], (None, 0, 0, 0))(lens, *single, single[0])
+    slope = jax.grad(lambda lens: losses(lens).sum())(lens)
+    assert min(abs(leaf) for leaf in jax.tree.leaves(slope)) > 0
+    program = step.lower(lens, *frames, frames[0]).compile()
+    whole = dof.scatter(names["image"], names["depth"], lens, max_coc=6.0)
+    return {
+        "error": error(
+            [names["blurred"], names["same"], names["slope"], names["spread"], names["view"]],
+            [
+                *[jax.vmap(names["blur"])(*single)] * 2,
+                slope,
+                whole,
+                names["image"],
+            ],
+        ),
+        "collectives": collectives(program),
+    }
+
+
+CHECKS = {
+    "page": page,
+    "memory": memory,
+    "batch": batch,
+    "rows": rows,
+    "target_rows": target_rows,
+}
 
 
 def main():
