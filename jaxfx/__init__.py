@@ -71,7 +71,7 @@ _MODULES = frozenset(
     {
         *("blur", "dof", "reproject", "shadow", "relight"),
         *("fit", "budget", "metrics", "tradeoff"),
-        *("depth", "scene", "exr", "io"),
+        *("depth", "scene", "exr", "io", "sharding"),
     }
 )
 

@@ -38,7 +38,7 @@ NUMERICS = {
     "_xla",
     *("_loops", "_meshes", "_progress", "_pyramid", "_sampling", "_tiles"),
 }
-TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "transfer"}
+TYPES = {"_arguments", "camera", "depth", "gbuffer", "lens", "light", "sharding", "transfer"}
 EFFECTS = {"blur", "dof", "reproject", "shadow", "relight"}
 HOST = {"_files", "scene", "exr", "io"}
 TOP = {"fit", "metrics", "tradeoff", "budget"}

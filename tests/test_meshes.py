@@ -31,7 +31,7 @@ def test_an_explicit_mesh_is_as_good_as_an_automatic_one(kind):
 
 
 def test_a_function_of_no_mesh_is_called_as_it_is():
-    assert on_any_mesh(lambda x, y=2: (x, y))(3, y="a") == (3, "a")
+    assert on_any_mesh(lambda x, y=2: (x, y))(3, y=4) == (3, 4)
 
 
 def test_a_single_device_computes_the_function_itself():

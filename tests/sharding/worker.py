@@ -5,16 +5,20 @@ arguments. JAX counts its devices once, so that they can't be made in the proces
 `XLA_FLAGS` makes them in this one.
 """
 
+import functools
 import json
 import re
 import sys
 import traceback
+from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
+from jaxfx import PinholeCamera, ThinLens, blur, dof, reproject, shadow, sharding
 from tests.helpers import quick
 from tests.test_transforms import CASES
 
@@ -92,7 +96,138 @@ def batch(name, mesh, gradient=True, size=(9, 7), shape=(DEVICES,), names=("batc
     }
 
 
-CHECKS = {"batch": batch}
+def picture(height, width=7):
+    """An image, its depth and points in a light's space, in seeded random numbers."""
+    rng = np.random.default_rng(3)
+    image = rng.uniform(0.1, 1, (height, width, 3))
+    depth = rng.uniform(1.1, 6, (height, width))
+    places = rng.uniform(-2, 12, (2, height, width))
+    seen = shadow.Receivers(*places, *rng.uniform(1.1, 4, (2, height, width)))
+    return image, depth, seen
+
+
+LENS = ThinLens(0.3, 2.5, 20.0)
+MAP = np.random.default_rng(4).uniform(1.1, 4, (10, 10))
+# The halo of each effect, where rows have to be divided, its images and what has no rows.
+BY_ROWS = {
+    "scatter": (5, 1, dof.scatter, 2, {"lens": LENS, "max_coc": 6.0}),
+    "layered": (5, 1, dof.layered, 2, {"lens": LENS, "max_coc": 6.0}),
+    "gather": (8, 4, dof.gather, 2, {"lens": LENS, "max_coc": 6.0}),
+    "separable": (5, 1, dof.separable, 2, {"lens": LENS, "max_coc": 6.0}),
+    "blur": (4, 1, blur.gaussian, 1, {"sigma": jnp.asarray(1.5), "taps": 9}),
+    "pcf": (
+        0,
+        1,
+        lambda seen, shadow_map: shadow.pcf(shadow_map, seen, size=3, bias=0.1),
+        slice(2, 3),
+        {"shadow_map": MAP},
+    ),
+}
+
+
+def rows(name, mesh, height):
+    """An effect of an image whose rows lie on eight devices, and its gradient."""
+    halo, align, effect, which, others = BY_ROWS[name]
+    images = picture(height)[which if isinstance(which, slice) else slice(which)]
+    devices = mesh_of(mesh)
+    divided = sharding.rows(effect, devices, halo=halo, align=align)
+    arrays, static = eqx.partition(others, eqx.is_array)
+
+    def with_gradient(effect):
+        def call(images, arrays):
+            run = lambda *data: effect(*data[0], **eqx.combine(data[1], static))
+            out, pull = jax.vjp(run, images, arrays)
+            return out, pull(out)
+
+        return jax.jit(call)
+
+    expected = with_gradient(effect)(images, arrays)
+    is_even = height % (DEVICES * align) == 0
+    placed = images
+    if is_even:
+        placed = jax.device_put(images, NamedSharding(devices, PartitionSpec("batch")))
+    compiled = with_gradient(divided).lower(placed, arrays).compile()
+    found = compiled(placed, arrays)
+    forward = jax.jit(lambda *images: divided(*images, **others)).lower(*placed).compile()
+    return {
+        "error": error(found, expected),
+        "collectives": collectives(forward),
+        "is_spread": not is_even or found[0].sharding.spec[:1] == ("batch",),
+    }
+
+
+def target_rows(mesh, height):
+    """`warp`, whose rows eight devices share out, and its gradient."""
+    image, depth, _ = picture(9)
+    camera = PinholeCamera.from_fov(1.0, height=9, width=7)
+    pose = np.eye(4)
+    pose[:3, 3] = 0.3, -0.2, 0.1
+    target = PinholeCamera.from_fov(0.9, height=height, width=7, world_from_camera=pose)
+    divided = sharding.target_rows(reproject.warp, mesh_of(mesh), height=height)
+
+    def with_gradient(warp):
+        def call(*data):
+            def run(image, depth, camera, target):
+                return warp(target=target, image=image, depth=depth, camera=camera, width=7)
+
+            out, pull = jax.vjp(run, *data)
+            return out, pull(out)
+
+        return jax.jit(call)
+
+    data = image, depth, camera, target
+    single = with_gradient(functools.partial(reproject.warp, height=height))
+    return {"error": error(with_gradient(divided)(*data), single(*data))}
+
+
+def memory(count, side=8192):
+    """Bytes of each device for `scatter` of a large image, as compiled."""
+    devices = jax.make_mesh((count,), ("rows",), axis_types=(AxisType.Auto,))
+    spread = NamedSharding(devices, PartitionSpec("rows"))
+    shaped = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32, sharding=spread)
+    lens = jax.tree.map(lambda x: x.astype(jnp.float32), LENS)
+    divided = sharding.rows(dof.scatter, devices, halo=10)
+    call = lambda *images: divided(*images, lens=lens, max_coc=16.0)
+    compiled = jax.jit(call).lower(shaped(side, side, 3), shaped(side, side)).compile()
+    found = compiled.memory_analysis()
+    names = ("argument", "output", "temp")
+    return {name: getattr(found, f"{name}_size_in_bytes") for name in names}
+
+
+def page():
+    """What the page on many devices computes, block by block."""
+    text = (Path(__file__).parents[2] / "docs" / "devices.md").read_text(encoding="utf-8")
+    names: dict = {}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), names)
+    step, frames, lens = names["step"], names["frames"], names["lens"]
+    single = jax.tree.map(np.asarray, frames)
+    losses = lambda lens: jax.vmap(names["loss"], (None, 0, 0, 0))(lens, *single, single[0])
+    slope = jax.grad(lambda lens: losses(lens).sum())(lens)
+    assert min(abs(leaf) for leaf in jax.tree.leaves(slope)) > 0
+    program = step.lower(lens, *frames, frames[0]).compile()
+    whole = dof.scatter(names["image"], names["depth"], lens, max_coc=6.0)
+    return {
+        "error": error(
+            [names["blurred"], names["same"], names["slope"], names["spread"], names["view"]],
+            [
+                *[jax.vmap(names["blur"])(*single)] * 2,
+                slope,
+                whole,
+                names["image"],
+            ],
+        ),
+        "collectives": collectives(program),
+    }
+
+
+CHECKS = {
+    "page": page,
+    "memory": memory,
+    "batch": batch,
+    "rows": rows,
+    "target_rows": target_rows,
+}
 
 
 def main():

@@ -1,0 +1,54 @@
+"""A focus pull through frames on disk: restarted, and in constant memory."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxfx import ThinLens, dof, io
+
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+RUN = [sys.executable, EXAMPLES / "stream.py"]
+OPTIONS = ["--near", "2", "--far", "4", "--aperture", "0.3", "--focal", "20", "--max-coc", "6"]
+
+
+def make_frames(folder, count, size=(12, 10)):
+    rng = np.random.default_rng(0)
+    for name in ("color", "depth"):
+        (folder / name).mkdir(parents=True)
+    for i in range(count):
+        io.write_png(folder / "color" / f"{i:04}.png", rng.uniform(0, 1, (*size, 3)))
+        np.save(folder / "depth" / f"{i:04}.npy", rng.uniform(1.5, 6, size).astype(np.float32))
+
+
+def run(folder):
+    return subprocess.run([*RUN, folder, *OPTIONS], check=True, capture_output=True, text=True)
+
+
+def test_frames_are_refocused_and_what_is_written_stays(tmp_path):
+    make_frames(tmp_path, 3)
+    assert "3/3" in run(tmp_path).stderr
+    image = io.read_color(tmp_path / "color" / "0002.png").astype(np.float32)
+    depth = np.load(tmp_path / "depth" / "0002.npy")
+    expected = dof.scatter(image, depth, ThinLens(0.3, 4.0, 20.0), max_coc=6.0)
+    written = tmp_path / "refocused" / "0002.png"
+    np.testing.assert_allclose(io.read_color(written), expected, atol=0.005)
+    before = written.stat().st_mtime_ns
+    (tmp_path / "refocused" / "0001.png").unlink()
+    assert "1/1" in run(tmp_path).stderr
+    assert written.stat().st_mtime_ns == before
+
+
+@pytest.mark.full
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
+    """Kilobytes at most, of the largest process that has ended so far."""
+    peaks = []
+    for count in (20, 500):
+        make_frames(tmp_path / str(count), count)
+        run(tmp_path / str(count))
+        peaks.append(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+    assert peaks[1] < 1.1 * peaks[0], peaks
