@@ -10,6 +10,7 @@ import base64
 import html.parser
 import importlib
 import inspect
+import json
 import re
 import shutil
 import subprocess
@@ -30,12 +31,12 @@ SITE = ROOT / "build" / "site"
 PAGE_BYTES = 1_500_000
 
 MODULES = (
-    *("jaxfx", "dof", "blur", "reproject", "shadow", "relight", "fit", "budget"),
+    *("jaxfx", "dof", "blur", "reproject", "shadow", "relight", "fit", "budget", "sharding"),
     *("depth", "scene", "exr", "io", "metrics", "tradeoff"),
 )
 GUIDES = (
     *("depth_of_field", "blur", "reproject", "shadow", "relight", "fitting"),
-    *("charts", "stability"),
+    "charts",
 )
 
 
@@ -75,7 +76,7 @@ def public(name: str) -> dict[str, object]:
 
 def anchors() -> dict[str, str]:
     """Page and anchor of each public name, as it is written in texts."""
-    places = {name: f"api/{name}.md" for name in MODULES[1:]}
+    places = {}
     for module in MODULES:
         for name in public(module):
             place = f"api/{module}.md#{name.lower()}"
@@ -270,8 +271,44 @@ def guide(name: str, places: dict[str, str]) -> str:
                 count += 1
             else:
                 text = output.get("text") or data.get("text/plain", "")
-                if text.strip() and "widget" not in str(list(data)):
+                is_shown = "text/html" not in data and "widget" not in str(list(data))
+                if text.strip() and is_shown:
                     parts.append(f"```text\n{text.rstrip()}\n```")
+    return "\n\n".join(parts)
+
+
+def failures() -> str:
+    """The published failure cases of each effect: what is asked, and each method's figures."""
+    parts = [
+        "# Where methods fail",
+        "Each case states what is measured and the largest error that is asked. A figure in bold"
+        " exceeds it. A figure without a bound is only watched. The image of an effect has a row"
+        " per case and a column per method, in the order of its table. The tests hold these"
+        " figures: one that met its bound must meet it, any other may grow by half.",
+    ]
+    for path in sorted((DOCS / "stability").glob("*.json")):
+        cases = json.loads(path.read_text(encoding="utf-8"))
+        parts.append(f"## jaxfx.{path.stem}")
+        parts.append(
+            f"![Images of all cases and methods of {path.stem}](stability/{path.stem}.png)"
+        )
+        for name, case in cases.items():
+            parts.append(f"### {path.stem}: {name}\n\n{case['says']}")
+            asks = case["asks"]
+            if not asks:
+                continue
+            bounds = ("" if v is None else f", at most {v:g}" for v in asks.values())
+            heads = [f"{figure}{bound}" for figure, bound in zip(asks, bounds, strict=True)]
+            rows = ["| method | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+            for method, figures in case["figures"].items():
+                cells = []
+                for figure, bound in asks.items():
+                    value = figures.get(figure)
+                    text = "" if value is None else f"{value:.3g}"
+                    fails = value is not None and bound is not None and not value <= bound
+                    cells.append(f"**{text}**" if fails else text)
+                rows.append(f"| {method} | " + " | ".join(cells) + " |")
+            parts.append("\n".join(rows))
     return "\n\n".join(parts)
 
 
@@ -291,6 +328,7 @@ def write_pages() -> None:
     (PAGES / "guides").mkdir()
     (PAGES / "api").mkdir()
     made = {"which": which(places), "gradients": gradients(places)}
+    made["failures"] = failures()
     made |= {f"guides/{name}": guide(name, places) for name in GUIDES}
     made |= {f"api/{name}": reference(name, places) for name in MODULES}
     for name, source in (("changelog", "CHANGELOG.md"), ("contributing", "CONTRIBUTING.md")):

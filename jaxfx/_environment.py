@@ -1,6 +1,6 @@
-"""A picture of all directions: its spherical harmonics, and its blurs for rough mirrors.
+"""An image of all directions: its spherical harmonics, and its blurs for rough mirrors.
 
-Axes of a picture: y up, row 0 at the top; the middle column looks along -z, the right half lies
+Axes of an image: y up, row 0 at the top; the middle column looks along -z, the right half lies
 at +x. So a texel's direction is (cos(b) sin(a), sin(b), -cos(b) cos(a)), a being its angle to
 the right of the middle, b that above the horizon.
 
@@ -26,13 +26,13 @@ from jaxfx._numerics import safe_sqrt
 
 
 # The roughness of each level, and the most rows that it has, some two to a lobe's width. Level
-# 0 is the picture. More rows take memory with their cube; fewer blur once more.
+# 0 is the image. More rows take memory with their cube; fewer blur once more.
 ROUGHNESSES = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 _MOST_ROWS = (128, 64, 64, 32, 32, 32, 32)
 
 
 def heights(height: int) -> tuple[int, ...]:
-    """The rows of each level for a picture of `height` rows."""
+    """The rows of each level for an image of `height` rows."""
     return height, *(min(height, most) for most in _MOST_ROWS)
 
 
@@ -72,7 +72,7 @@ def _latitudes(height: int) -> Float[np.ndarray, " height"]:
 
 
 def _shrunk(image: Float[Array, "height width 3"], height: int) -> Float[Array, "_ _ 3"]:
-    """The picture with fewer rows: means by area."""
+    """The image with fewer rows: means by area."""
     if height == image.shape[0]:
         return image
     down, across = _means(image.shape[0], height), _means(image.shape[1], 2 * height)
@@ -92,7 +92,7 @@ def _means(size: int, to: int) -> Float[np.ndarray, "to size"]:
 
 
 def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
-    """The coefficients of `_harmonics`, in the picture's axes."""
+    """The coefficients of `_harmonics`, in the image's axes."""
     height, width = image.shape[:2]
     # Means over texels, in which the radiance is even: by four nodes along each side.
     nodes, weights = np.polynomial.legendre.leggauss(4)

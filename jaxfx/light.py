@@ -7,7 +7,7 @@
 | a lamp | `PointLight(position, color)` |
 | a lamp that shines into a cone | `SpotLight(position, direction, color, ...)` |
 | soft light from all around, without highlights | `SphericalHarmonicsLight(coefficients)` |
-| the surroundings, from a picture of all directions | `EnvironmentLight(image, rotation)` |
+| the surroundings, from an image of all directions | `EnvironmentLight(image)` |
 """
 
 from typing import Any, ClassVar, final
@@ -247,25 +247,26 @@ class SphericalHarmonicsLight(eqx.Module):
 
 @final
 class EnvironmentLight(eqx.Module):
-    """The surroundings, from a picture of all directions: a sky, a room, a panorama.
+    """The surroundings, from an image of all directions: a sky, a room, a panorama.
 
     Matt surfaces get nine spherical harmonics of it, GGX surfaces highlights from blurs of it
     as well. Both are made once, here: to turn the surroundings (`turned`) costs nothing.
 
     **Arguments:**
 
-    - `image`: height width 3, twice as wide as high, linear RGB radiance: the picture is
-      equirectangular, row 0 is straight up. Of the picture's axes y is up, the middle column
+    - `image`: height width 3, twice as wide as high, linear RGB radiance: the image is
+      equirectangular, row 0 is straight up. Of the image's axes y is up, the middle column
       looks along -z, the right half lies at +x.
-    - `rotation`: 3 3, from the picture's axes to the world's; None where they are the same, as
-      for a mesh file with y up.
-    - `color`: 3, which multiplies the picture.
+    - `world_from_image`: 3 3, a rotation from the image's axes to the world's; None where they
+      are the same, as for a mesh file with y up.
+    - `color`: 3, which multiplies the image.
 
     **Raises:** `ValueError` for another shape, a radiance that is negative, NaN or inf, or a
-    `rotation` that is none to 1e-3.
+    `world_from_image` that is no rotation to 1e-3.
 
-    **Gradient:** exact, through both approximations, with respect to `image`, `rotation` and
-    `color`. It jumps where a mirrored direction passes from texel to texel.
+    **Gradient:** exact, through both approximations, with respect to `image`,
+    `world_from_image` and `color`. It jumps where a mirrored direction passes from texel to
+    texel.
 
     **Example:** bright above, dark below:
 
@@ -276,7 +277,7 @@ class EnvironmentLight(eqx.Module):
     >>> light.coefficients.shape, light.heights[:2]
     ((9, 3), (16, 16))
 
-    - `coefficients`: 9 3, as in `SphericalHarmonicsLight`, in the picture's axes.
+    - `coefficients`: 9 3, as in `SphericalHarmonicsLight`, in the image's axes.
     - `pyramid`, `heights`: the texels of all blurs, and how many rows each has.
 
     The split sum takes a highlight for round, and as seen straight on: at grazing angles a true
@@ -286,15 +287,15 @@ class EnvironmentLight(eqx.Module):
     Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001.
     """
 
-    SHAPES: ClassVar = {"color": (3,), "rotation": (3, 3), "coefficients": (9, 3)}
+    SHAPES: ClassVar = {"color": (3,), "world_from_image": (3, 3), "coefficients": (9, 3)}
 
     color: Float[Array, "3"]
-    rotation: Float[Array, "3 3"]
+    world_from_image: Float[Array, "3 3"]
     coefficients: Float[Array, "9 3"]
     pyramid: Float[Array, "texel 3"]
     heights: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, image: Any, rotation: Any = None, color: Any = (1.0, 1.0, 1.0)):
+    def __init__(self, image: Any, world_from_image: Any = None, color: Any = (1.0, 1.0, 1.0)):
         image = parameter("EnvironmentLight(image)", image, None)
         height = image.shape[0] if image.ndim == 3 else 0
         if height == 0 or image.shape != (height, 2 * height, 3):
@@ -306,16 +307,20 @@ class EnvironmentLight(eqx.Module):
         check("EnvironmentLight(image)", image, is_radiance, "finite, 0 or positive")
         image = image.astype(working_dtype(image.dtype))
         self.color = _color("EnvironmentLight(color)", color)
-        rotation = np.eye(3) if rotation is None else rotation
-        self.rotation = _rotation("EnvironmentLight(rotation)", rotation)
+        if world_from_image is None:
+            world_from_image = np.eye(3)
+        self.world_from_image = _rotation(
+            "EnvironmentLight(world_from_image)", world_from_image
+        )
         self.heights = _environment.heights(height)
         self.coefficients = jax.jit(_environment.coefficients)(image)
         self.pyramid = jax.jit(_environment.blurs)(image)
 
-    def turned(self, rotation: Any) -> "EnvironmentLight":
+    def turned(self, world_from_image: Any) -> "EnvironmentLight":
         """The same surroundings, turned otherwise; nothing is blurred again.
 
-        **Arguments:** `rotation`: 3 3, from the picture's axes to the world's.
+        **Arguments:** `world_from_image`: 3 3, a rotation from the image's axes to the
+        world's.
 
         **Returns:** the new `EnvironmentLight`.
 
@@ -323,8 +328,8 @@ class EnvironmentLight(eqx.Module):
 
         **Gradient:** exact.
         """
-        rotation = _rotation("turned(rotation)", rotation)
-        return eqx.tree_at(lambda light: light.rotation, self, rotation)
+        turn = _rotation("turned(world_from_image)", world_from_image)
+        return eqx.tree_at(lambda light: light.world_from_image, self, turn)
 
 
 def _rotation(name: str, value: Any) -> Float[Array, "3 3"]:

@@ -332,7 +332,7 @@ CALLS = {
     "SphericalHarmonicsLight": (SphericalHarmonicsLight, {"coefficients": np.ones((9, 3))}),
     "EnvironmentLight": (
         EnvironmentLight,
-        {"image": np.ones((4, 8, 3)), "rotation": np.eye(3), "color": np.ones(3)},
+        {"image": np.ones((4, 8, 3)), "world_from_image": np.eye(3), "color": np.ones(3)},
     ),
     "PointLight": (PointLight, {"position": np.ones(3), "color": np.ones(3)}),
     "SpotLight": (
@@ -384,7 +384,7 @@ WRONG = {
 }
 # Left out, these are something else.
 MAY_BE_NONE = {
-    "rotation",
+    "world_from_image",
     *(
         "bias",
         "slope_bias",
@@ -538,7 +538,7 @@ def test_check_camera_and_check_light():
 
 def test_no_function_is_forgotten():
     """Every public function of arrays, and every class, has valid arguments in `CALLS`."""
-    host = {"scene", "exr", "io", "tradeoff"}
+    host = {"scene", "exr", "io", "tradeoff", "sharding"}
     records = {"Plan", "Accumulation", "Choice", "Synthesis", "Hit", "Receivers", "Candidates"}
     records |= {"Lens", "Filled", "FilledCache", "LinearTaps", "Projection", "Rays"}
     for module in pkgutil.iter_modules(jaxfx.__path__):

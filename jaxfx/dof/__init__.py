@@ -4,7 +4,7 @@
 |---|---|
 | the best result from one image and its depth | `layered` |
 | the same where a second layer of depth is known | `layered(behind=(image, depth))` |
-| a guess of that layer, from the picture itself | `peel` |
+| a guess of that layer, from the image itself | `peel` |
 | blades, rounded blades or an anamorphic lens | `Iris`, of `scatter`, `layered`, `accumulate` |
 | a preview within 0.5 dB in a tenth of the time | `separable` |
 | a lens found from an image | `fit.dof`, through `layered` or `scatter` |

@@ -1,4 +1,4 @@
-"""What the nearest surface hides, guessed from the picture itself: a second layer of depth."""
+"""What the nearest surface hides, guessed from the image itself: a second layer of depth."""
 
 import functools as ft
 from typing import NamedTuple
@@ -29,10 +29,10 @@ def peel(
     max_coc: Number | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
 ) -> tuple[Float[Array, "height width channel"], Float[Array, "height width"]]:
-    """A guess of the surface behind the first, for `layered(behind=...)`, from one picture.
+    """A guess of the surface behind the first, for `layered(behind=...)`, from one image.
 
     Next to an edge in depth a lens sees past the nearer surface. There the farther one is taken
-    to go on, with the colour and depth that it has where the picture shows it.
+    to go on, with the colour and depth that it has where the image shows it.
 
     **Arguments:**
 
@@ -67,7 +67,7 @@ def peel(
     >>> dof.layered(image, depth, lens, behind=hidden).shape
     (8, 8, 3)
 
-    A pixel takes the nearest one, in the picture, of those that lie behind it and show past
+    A pixel takes the nearest one, in the image, of those that lie behind it and show past
     it. Through a lens two points of one pixel move apart by up to half their difference in
     defocus: what is farther away than that, and a pixel more, does not show. So nothing is
     guessed behind a surface that is merely slanted, by up to a pixel of defocus per pixel.
@@ -120,7 +120,7 @@ def _nearest_behind(
     threshold: Float[Array, ""],
     max_coc: float,
 ) -> Sources:
-    """The nearest pixel, in the picture, of those that lie behind each and show past it."""
+    """The nearest pixel, in the image, of those that lie behind each and show past it."""
     lengths = [1] * (1 + _LAST_ROUNDS)
     while 2 * lengths[0] - 1 < max_coc:  # together they reach so far
         lengths.insert(0, 2 * lengths[0])

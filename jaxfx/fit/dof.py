@@ -187,9 +187,11 @@ def dof(
     - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where its steps gain next to nothing.
-    - `parameters`: the names to fit, out of `fit.PARAMETERS` or, of `"layered"`, out of
-      `fit.LAYERED_PARAMETERS`, which are the default, and of `fit.DISPARITY_PARAMETERS`: the
-      inverse depth is `scale` times the given one plus `shift`.
+    - `parameters`: the names to fit. By default those of the effect, `fit.PARAMETERS`
+      (aperture, focus_distance, gamma, epsilon) or `fit.LAYERED_PARAMETERS` (aperture,
+      focus_distance, threshold). With either also `fit.DISPARITY_PARAMETERS`, scale and shift:
+      the inverse depth is then `scale / depth + shift`. One photograph determines two of
+      aperture, focus_distance, scale and shift; of three or four the standard errors are inf.
     - `ratios`: those of the lenses' parameters whose ratios are known to be the starts'.
     - `max_steps`: of the solver, each time it starts.
     - `throw`: raise where the fit is no success; else `doubt` says why.
@@ -266,6 +268,10 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
     references = model.images.references
     is_single, is_plain = len(references) == 1, "footprint" not in model.names
+    # A photograph tells two numbers: aperture x scale, and aperture x (1 / focus - shift).
+    sought = [name for name in (*LENS, *DISPARITY) if name in end.unknowns]
+    if sum(jnp.size(end.unknowns[name]) for name in sought) > 2 * len(references):
+        variances |= {name: jnp.full_like(variances[name], jnp.inf) for name in sought}
     standard_errors = {}
     for name in (name for name in model.names if name != "footprint"):
         error = jnp.abs(slopes[name].astype(float)) * jnp.sqrt(variances[name])

@@ -289,7 +289,7 @@ def received(
     if isinstance(light, SphericalHarmonicsLight):
         return _from_around(surface, surface.normal, light.coefficients), None, None
     if isinstance(light, EnvironmentLight):
-        return _from_picture(surface, light)
+        return _from_surroundings(surface, light)
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
     cosine = _dot(surface.normal, to_light)
     halfway = _unit(to_light + surface.to_camera)
@@ -327,11 +327,11 @@ def _from_around(
     return jnp.where(has_normal[..., None], diffuse, 0)
 
 
-def _from_picture(
+def _from_surroundings(
     surface: Surface, light: EnvironmentLight
 ) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
-    """The three parts of the light of a picture of all directions."""
-    column = lambda k: jnp.broadcast_to(light.rotation[:, k], surface.normal.shape)
+    """The three parts of the light of an image of all directions."""
+    column = lambda k: jnp.broadcast_to(light.world_from_image[:, k], surface.normal.shape)
     turned = lambda way: jnp.stack([_dot(way, column(k)) for k in range(3)], axis=-1)
     color = light.color[None, None]
     diffuse = color * _from_around(surface, turned(surface.normal), light.coefficients)
@@ -340,10 +340,12 @@ def _from_picture(
     mirrored = 2 * surface.facing[..., None] * surface.normal - surface.to_camera
     lobe = mean_lobe(surface.facing, jnp.sqrt(roughness_squared(surface.exponent)))
     toward = surface.normal + lobe.mirrored[..., None] * (mirrored - surface.normal)
-    picture = _environment.look_up(light.pyramid, light.heights, turned(toward), lobe.roughness)
+    reflected = _environment.look_up(
+        light.pyramid, light.heights, turned(toward), lobe.roughness
+    )
     is_ggx = (surface.shader == _GGX) & (_dot(surface.normal, surface.normal) != 0)
     specular, grazing = (
-        jnp.where(is_ggx[..., None], color * picture * mean[..., None], 0)
+        jnp.where(is_ggx[..., None], color * reflected * mean[..., None], 0)
         for mean in (lobe.specular, lobe.grazing)
     )
     return diffuse, specular, grazing

@@ -1,4 +1,4 @@
-"""Where to put cameras so that their pictures hold what others will want to see."""
+"""Where to put cameras so that their images hold what others will want to see."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -39,7 +39,7 @@ def plan_views(
     height: WholeNumber,
     width: WholeNumber,
 ) -> ViewPlan:
-    """The few cameras whose pictures cover most of what other cameras will see.
+    """The few cameras whose images cover most of what other cameras will see.
 
     Render a cache from each, and `relight.synthesize` has few holes to fill in the targets.
 
@@ -49,9 +49,9 @@ def plan_views(
     - `targets`: the cameras that views are wanted of: a path, say.
     - `candidates`: the cameras to choose from; None chooses from the targets.
     - `count`: how many to choose, at most: where nothing is left to be gained, fewer are.
-    - `height`, `width`: size of all pictures in pixels. Every pixel of a target that shows a
+    - `height`, `width`: size of all images in pixels. Every pixel of a target that shows a
       surface is one point. As many are tested as targets have pixels, from each candidate: for
-      a plan, cameras of small pictures will do.
+      a plan, cameras of small images will do.
 
     **Returns:** a `ViewPlan`.
 
@@ -70,10 +70,10 @@ def plan_views(
     >>> len(plan.cameras), plan.covered[0] < plan.covered[1] <= 1
     (2, True)
 
-    A camera sees a point that lies in its picture, of whose face it sees the same side, and
+    A camera sees a point that lies in its image, of whose face it sees the same side, and
     from which nothing hides it. The one that sees most is taken, then the one that sees most of
     the rest, and so on: at least 63 % of what the best choice of as many would see. Then one is
-    exchanged for another as long as that gains, and the order is made anew.
+    exchanged for another as long as that gains, and the order is made again.
 
     Source: Nemhauser, Wolsey & Fisher 1978, the bound; points and exchanges are our own.
     """
