@@ -281,10 +281,10 @@ def failures() -> str:
     """The published failure cases of each effect: what is asked, and each method's figures."""
     parts = [
         "# Where methods fail",
-        "Each case states what is measured and the largest error that is asked. A figure in bold"
-        " exceeds it. A figure without a bound is only watched. The image of an effect has a row"
-        " per case and a column per method, in the order of its table. The tests hold these"
-        " figures: one that met its bound must meet it, any other may grow by half.",
+        "Each case states what is measured and the largest error that is asked. A figure in"
+        " bold exceeds it. A figure without a bound is only watched. The image of an effect has"
+        " a row per case and a column per method, in the order of its table. The tests hold"
+        " these figures: one that met its bound must meet it, any other may grow by half.",
     ]
     for path in sorted((DOCS / "stability").glob("*.json")):
         cases = json.loads(path.read_text(encoding="utf-8"))
