@@ -111,7 +111,7 @@ MAP = np.random.default_rng(4).uniform(1.1, 4, (10, 10))
 # The halo of each effect, where rows have to be divided, its images and what has no rows.
 BY_ROWS = {
     "scatter": (5, 1, dof.scatter, 2, {"lens": LENS, "max_coc": 6.0}),
-    "layered": (5, 1, dof.layered, 2, {"lens": LENS, "max_coc": 6.0}),
+    "layered": (5, 1, dof.layered, 2, {"lens": LENS, "max_coc": 6.0, "behind": None}),
     "gather": (8, 4, dof.gather, 2, {"lens": LENS, "max_coc": 6.0}),
     "separable": (5, 1, dof.separable, 2, {"lens": LENS, "max_coc": 6.0}),
     "blur": (4, 1, blur.gaussian, 1, {"sigma": jnp.asarray(1.5), "taps": 9}),
