@@ -8,6 +8,7 @@ The first parameter, `name`, is the argument's name in errors: "scatter(max_coc=
 from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -30,6 +31,22 @@ def is_concrete(*values: Any) -> bool:
     """Whether all arrays in `values` have values now: none of them is traced."""
     leaves = jax.tree.leaves(values)
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+
+
+def with_numbers(module: Any) -> str:
+    """The text of a module of scalars with their values, where these are known.
+
+    Equinox' own shows types and shapes, `f32[]`, of which a scalar's value is not one.
+    """
+
+    def text(value: Any) -> str:
+        is_number = isinstance(value, jax.Array | np.ndarray | float | int)
+        if is_number and is_concrete(value) and np.ndim(value) == 0:
+            return f"{np.asarray(value)[()]:.6g}"
+        return eqx.tree_pformat(value)
+
+    fields = (f"{name}={text(value)}" for name, value in vars(module).items())
+    return f"{type(module).__name__}({', '.join(fields)})"
 
 
 def as_array(name: str, value: Any) -> Array:

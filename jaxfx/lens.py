@@ -19,7 +19,14 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
+from jaxfx._checks import (
+    WholeNumber,
+    check,
+    check_fields,
+    parameter,
+    whole_number,
+    with_numbers,
+)
 from jaxfx._numerics import absolute, clip01, working_dtype
 from jaxfx.camera import PinholeCamera
 
@@ -141,6 +148,9 @@ class ThinLens(eqx.Module):
     aperture: Float[Array, ""]
     focus_distance: Float[Array, ""]
     focal_pixels: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        return with_numbers(self)
 
     def __init__(self, aperture: Any, focus_distance: Any, focal_pixels: Any):
         name = "ThinLens(focus_distance)"
@@ -450,6 +460,9 @@ class FocusPlanes(eqx.Module):
     focus: Float[Array, ""]
     far: Float[Array, ""]
     max_coc: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        return with_numbers(self)
 
     def __init__(self, near: Any, focus: Any, far: Any, max_coc: Any):
         self.near = parameter("FocusPlanes(near)", near)

@@ -493,3 +493,14 @@ def test_the_three_numbers_are_all_that_an_image_knows():
         np.testing.assert_allclose(
             lens.defocus(depth), same.defocus(depth), rtol=1e-12, atol=1e-12
         )
+
+
+def test_a_lens_prints_its_numbers_and_a_traced_one_its_types():
+    lens = ThinLens(0.1, 2.0, 100.0)
+    assert repr(lens) == "ThinLens(aperture=0.1, focus_distance=2, focal_pixels=100)"
+    assert repr(FocusPlanes(1.0, 2.0, 4.0, 8.0)).endswith("(near=1, focus=2, far=4, max_coc=8)")
+    texts = []
+    jax.jit(lambda lens: texts.append(repr(lens)))(lens)
+    jax.vmap(lambda lens: texts.append(repr(lens)))(jax.tree.map(jnp.atleast_1d, lens))
+    assert all(text.startswith("ThinLens(aperture=") and "[]" in text for text in texts)
+    assert "[1]" in repr(jax.tree.map(jnp.atleast_1d, lens))

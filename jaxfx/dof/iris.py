@@ -21,6 +21,7 @@ from jaxfx._checks import (
     is_concrete,
     parameter,
     whole_number,
+    with_numbers,
 )
 from jaxfx.dof.sprites import row_half_width
 
@@ -68,6 +69,9 @@ class Iris(eqx.Module):
     rotation: Float[Array, ""]
     roundness: Float[Array, ""] | None
     squeeze: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        return with_numbers(self)
 
     def __init__(
         self,
