@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx import _checks
+from jaxfx import ThinLens, _checks
 
 
 def test_is_concrete():
@@ -301,6 +301,14 @@ def test_static_numbers_are_not_traced():
     for read in (_checks.number, _checks.whole_number):
         with pytest.raises(ValueError, match=r"`f\(n=...\)` must be .* static, got a traced"):
             jax.jit(lambda n, read=read: read("f(n=...)", n))(3)
+
+
+def test_a_module_of_scalars_shows_its_numbers():
+    lens = ThinLens(0.1, 2.0, 100.0)
+    text = _checks.with_numbers(lens)
+    assert text == "ThinLens(aperture=0.1, focus_distance=2, focal_pixels=100)"
+    no_scalar = jax.tree.map(lambda x: jnp.stack([x, x]), lens)
+    assert "aperture=f" in _checks.with_numbers(no_scalar)
 
 
 def test_every_helper_is_tested():

@@ -277,9 +277,11 @@ def test_errors_name_the_argument():
             ValueError, match=r"`EnvironmentLight\(image\)` must be finite, 0 or"
         ):
             make(wrong)
-    with pytest.raises(ValueError, match=r"`EnvironmentLight\(rotation\)` must be a rotation"):
+    with pytest.raises(
+        ValueError, match=r"`EnvironmentLight\(world_from_image\)` must be a rotation"
+    ):
         make(good, np.diag([1.0, 1.0, -1.0]))
-    with pytest.raises(ValueError, match=r"`turned\(rotation\)` must be a rotation"):
+    with pytest.raises(ValueError, match=r"`turned\(world_from_image\)` must be a rotation"):
         make(good).turned(2 * np.eye(3))
 
 
