@@ -55,7 +55,7 @@ def test_both_searches_across_find_the_same_pixel(share):
     both = []
     for search in (holes._widening, holes._in_two_passes):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(holes, "by_platform", lambda *x, cpu, accelerator, f=search: f(*x))
+            patch.setattr(holes, "at_once", lambda cpu, accelerator, f=search: f)
             both.append(holes._nearest_covered(jnp.asarray(covered), jnp.asarray(~covered)))
     (found, near), (same, other) = both
     np.testing.assert_array_equal(found, same)
