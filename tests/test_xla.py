@@ -32,3 +32,10 @@ def test_a_stored_value_that_is_not_needed_is_zero():
     for is_needed in (True, False):
         out = jaxfx._xla.stored(jnp.array(is_needed), double, jnp.arange(3.0))
         np.testing.assert_array_equal(out["twice"], is_needed * 2 * np.arange(3.0))
+
+
+@pytest.mark.parametrize("axis", [0, 1, -1])
+def test_planes_are_summed_over_any_axis(axis):
+    planes = np.random.default_rng(0).random((3, 4, 5))
+    total = jaxfx._xla.sum_planes(jnp.asarray(planes), axis)
+    np.testing.assert_allclose(total, planes.sum(axis=axis), rtol=1e-15)
