@@ -94,8 +94,8 @@ def write(images: dict[str, np.ndarray], path: Path) -> None:
         ax.set_title(title, fontsize=9)
         ax.set_axis_off()
     stream = BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    Image.open(stream).convert("RGB").quantize(255, dither=Image.Dither.NONE).save(path)
+    figure.savefig(stream, format="png", dpi=67)
+    Image.open(stream).convert("RGB").quantize(48, dither=Image.Dither.NONE).save(path)
 
 
 def print_plans() -> None:

@@ -65,4 +65,4 @@ def test_images_are_shown_and_small():
     images = [path for path in (ROOT / "docs").iterdir() if path.suffix in (".jpg", ".png")]
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     assert all(path.name in text for path in images)
-    assert sum(path.stat().st_size for path in images) < 600_000
+    assert sum(path.stat().st_size for path in images) < 400_000
