@@ -1,4 +1,4 @@
-"""What a guess of the hidden layer is worth to `layered`, in decibels.
+"""The gain of a guessed hidden layer to `layered`, in decibels.
 
 `python -m benchmarks.hidden_layers [MESH ...]` prints a row for each of three foci and two
 apertures of every scene: the PSNR of one layer to the multi-pass reference, and how much more

@@ -360,7 +360,7 @@ class _Page(html.parser.HTMLParser):
 
 
 def problems() -> list[str]:
-    """What is wrong with the pages of `SITE`, a line each."""
+    """The errors on the pages of `SITE`, a line each."""
     # The page of errors is served anywhere: its links begin at the server's root.
     paths = (path for path in sorted(SITE.rglob("*.html")) if path.name != "404.html")
     pages = {path: _Page(path) for path in paths}

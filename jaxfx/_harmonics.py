@@ -21,7 +21,7 @@ _LEFT = np.repeat([1, 2 / 3, 1 / 4], [1, 3, 5])
 def irradiance(
     normal: Float[Array, "height width 3"], coefficients: Float[Array, "9 3"]
 ) -> Float[Array, "height width 3"]:
-    """What a white Lambert surface shows under the radiance that has these coefficients.
+    """The colour of a white Lambert surface under the radiance that has these coefficients.
 
     The functions are, in the order of l, then m: 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy, each
     times its factor.

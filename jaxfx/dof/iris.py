@@ -255,7 +255,7 @@ def chord(
 def _strip(
     outline: Outline, piece: Pieces, low: Float[Array, "*shape"], high: Float[Array, "*shape"]
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-    """What a piece adds to the area of a strip, and to its first moment along x.
+    """The share of a piece in the area of a strip, and in its first moment along x.
 
     Of the part of the piece between the two heights, the integrals of x and of x**2 / 2 along
     y: those of its chord, and of the circular segment beyond the chord.

@@ -1,4 +1,4 @@
-"""What the nearest surface hides, guessed from the image itself: a second layer of depth."""
+"""A second layer of depth, hidden by the nearest surface, guessed from the image itself."""
 
 import functools as ft
 from typing import NamedTuple
@@ -88,7 +88,7 @@ def peel(
 
 
 class Sources(NamedTuple):
-    """From where each pixel takes its hidden surface: so many pixels down and to the right.
+    """Offset in pixels, down and to the right, to the source of each pixel's hidden surface.
 
     `defocus` is that of the source, in pixels, and -inf where there is none.
     """

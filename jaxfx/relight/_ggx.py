@@ -94,7 +94,7 @@ _ROUGHNESSES, _COSINES = 33, 65
 
 
 class MeanLobe(NamedTuple):
-    """What a highlight makes of light from everywhere, at each pixel.
+    """The response of a highlight to light from everywhere, per pixel.
 
     - `specular`, `grazing`: of light that is the same from everywhere, the integrals over all
       directions of `lobe * (1 - w) / pi` and of `lobe * w / pi`.

@@ -260,7 +260,7 @@ def reflected(surface: Surface, light: Light) -> _Vectors:
 def with_reflectances(
     surface: Surface, diffuse: _Vectors, specular: _Vectors | None, grazing: _Vectors | None
 ) -> _Vectors:
-    """What the surface reflects of the three parts of the light that it receives."""
+    """The radiance that the surface reflects, from the three parts of the light it receives."""
     matte = surface.diffuse
     if surface.facing is not None:
         is_ggx = (surface.shader == _GGX)[..., None]

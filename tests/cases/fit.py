@@ -143,7 +143,7 @@ def _blurred(change, loss, **options):
 
 
 def _photograph(seed, image, depth, lens=TRUE_LENS):
-    """What `scatter` makes of it, with noise of half a percent."""
+    """The image through the lens, by `scatter`, with noise of half a percent."""
     drawn = np.asarray(dof.scatter(image, depth, lens, max_coc=16.0))
     return drawn + 0.005 * np.random.default_rng(seed).normal(size=drawn.shape)
 
