@@ -1,4 +1,4 @@
-"""The cost of a wrong iris in decibels: scatter and layered by disc and by hexagon, to many pinholes.
+"""The cost of a wrong iris: scatter and layered by disc and by hexagon, to many pinholes.
 
 `python -m benchmarks.iris_shapes [--out FILE.png]` renders planes with lights of 50 times white
 through a hexagonal lens, pass by pass, and prints the PSNR of each method to that, clipped to

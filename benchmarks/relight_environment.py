@@ -95,7 +95,7 @@ def write(images: dict[str, np.ndarray], path: Path) -> None:
         ax.set_axis_off()
     stream = BytesIO()
     figure.savefig(stream, format="png", dpi=80)
-    Image.open(stream).convert("RGB").save(path, quality=66, optimize=True)
+    Image.open(stream).convert("RGB").save(path, quality=60, optimize=True)
 
 
 def print_plans() -> None:
