@@ -353,3 +353,13 @@ def _complaints(value):
 def test_a_public_name_is_documented(name):
     complaints = list(_complaints(PUBLIC_OBJECTS[name]))
     assert not complaints, f"{name}: " + "; ".join(complaints)
+
+
+def test_the_checks_name_every_folder_of_tests_and_no_other():
+    script = TESTS.parent / ".ci" / "run"
+    if not script.exists():
+        pytest.skip("a source distribution holds no .ci")
+    named = set(re.findall(r"\btests/(\w+)(?=[ \n])", script.read_text(encoding="utf-8")))
+    paths = [path.relative_to(TESTS).parts[0] for path in TESTS.rglob("test_*.py")]
+    folders = {path for path in paths if (TESTS / path).is_dir()}
+    assert named == folders - {"helpers"}  # whose only tests are quick ones
