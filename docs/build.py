@@ -159,24 +159,22 @@ def reference(module: str, places: dict[str, str]) -> str:
 
 def gradients(places: dict[str, str]) -> str:
     """A table of the Gradient line of each function."""
-    rows = [
-        "# Gradients",
-        "What can be differentiated, and where a derivative is zero, biased or",
-    ]
-    rows[1] += (
-        " missing: the Gradient lines of all public functions and classes. Each is tested in"
-    )
-    rows[1] += " forward and reverse mode against finite differences in float64."
-    rows += ["", "| call | gradient |", "|---|---|"]
+    text = """# Gradients
+
+What can be differentiated, and where a derivative is zero, biased or missing: the Gradient
+lines of all public functions and classes. Each is tested in forward and reverse mode against
+finite differences in float64.
+"""
+    rows = [text, "| call | gradient |", "|---|---|"]
     for module in MODULES:
         for name, value in public(module).items():
             doc = inspect.cleandoc(value.__doc__ or "")
             found = re.search(r"\*\*Gradients?:\*\*(.*?)(?:\n\n|\Z)", doc, re.DOTALL)
             if found:
-                text = " ".join(found[1].split()).replace("|", "‖")
+                line = " ".join(found[1].split()).replace("|", "‖")
                 call = name if module == "jaxfx" else f"{module}.{name}"
-                rows.append(f"| `{call}` | {text[:1].upper()}{text[1:]} |")
-    return linked("\n".join(rows[:2]) + "\n\n" + "\n".join(rows[3:]), "", places)
+                rows.append(f"| `{call}` | {line[:1].upper()}{line[1:]} |")
+    return linked("\n".join(rows), "", places)
 
 
 def which(places: dict[str, str]) -> str:

@@ -33,6 +33,8 @@ HEIGHT, WIDTH = 240, 320
 FRAMES = 13
 # Scene units: of the still life, whose objects are 2 to 5 away.
 APERTURE, FOCUS = 0.12, 2.6
+# Everything beyond this depth is the wall.
+WALL = 4.5
 
 
 def write(name: str, image) -> None:
@@ -58,15 +60,15 @@ def main() -> None:
     write("pinhole", image)
     write("depth_of_field", dof.layered(image, depth, lens, behind=behind))
 
-    # Lights of 50 x white in the background become discs.
+    # Lights of 50 x white on the wall take the shape of the iris.
     rng = np.random.default_rng(3)
     lamps = np.array(image)
-    rows, columns = rng.integers(4, HEIGHT // 3, 40), rng.integers(4, WIDTH - 4, 40)
-    hues = 0.3 + 0.7 * rng.random((40, 3))
-    lamps[rows, columns] = 50 * hues
-    far = np.array(depth)
-    far[rows, columns] = 12.0
-    write("highlights", dof.layered(lamps, far, lens))
+    wall = np.argwhere(np.asarray(depth)[: HEIGHT // 3] > WALL)
+    rows, columns = rng.choice(wall, 30, replace=False).T
+    lamps[rows, columns] = 50 * (0.3 + 0.7 * rng.random((30, 3)))
+    iris = dof.Iris(blades=6, rotation=0.3)
+    wide = ThinLens.from_camera(camera, aperture=2 * APERTURE, focus_distance=FOCUS)
+    write("highlights", dof.layered(lamps, depth, wide, iris=iris))
 
     angle = np.deg2rad(2.5)
     turn = np.eye(4)
