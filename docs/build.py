@@ -256,7 +256,8 @@ def guide(name: str, places: dict[str, str]) -> str:
         code = f"```python\n{cell.source}\n```"
         lines = cell.source.count("\n") + 1
         if lines > OPEN_LINES:
-            summary = f"<summary>Code, {lines} lines</summary>"
+            needs = ", in a checkout of the sources" if "benchmarks" in cell.source else ""
+            summary = f"<summary>Code, {lines} lines{needs}</summary>"
             code = f"<details markdown>\n{summary}\n\n{code}\n\n</details>"
         parts.append(code)
         for output in cell.get("outputs", ()):
@@ -276,14 +277,8 @@ def guide(name: str, places: dict[str, str]) -> str:
 
 
 def failures() -> str:
-    """The published failure cases of each effect: what is asked, and each method's figures."""
-    parts = [
-        "# Where methods fail",
-        "Each case states what is measured and the largest error that is asked. A figure in"
-        " bold exceeds it. A figure without a bound is only watched. The image of an effect has"
-        " a row per case and a column per method, in the order of its table. The tests hold"
-        " these figures: one that met its bound must meet it, any other may grow by half.",
-    ]
+    """The text about failures, then each published case: what is asked, and the figures."""
+    parts = [(DOCS / "failures.md").read_text(encoding="utf-8")]
     for path in sorted((DOCS / "stability").glob("*.json")):
         cases = json.loads(path.read_text(encoding="utf-8"))
         parts.append(f"## jaxfx.{path.stem}")
@@ -326,7 +321,7 @@ def write_pages() -> None:
     (PAGES / "guides").mkdir()
     (PAGES / "api").mkdir()
     made = {"which": which(places), "gradients": gradients(places)}
-    made["failures"] = failures()
+    made["failures"] = linked(failures(), "", places)
     made |= {f"guides/{name}": guide(name, places) for name in GUIDES}
     made |= {f"api/{name}": reference(name, places) for name in MODULES}
     for name, source in (("changelog", "CHANGELOG.md"), ("contributing", "CONTRIBUTING.md")):

@@ -6,8 +6,8 @@
 | the same where a second layer of depth is known | `layered(behind=(image, depth))` |
 | a guess of that layer, from the image itself | `peel` |
 | blades, rounded blades or an anamorphic lens | `Iris`, of `scatter`, `layered`, `accumulate` |
-| a preview within 0.5 dB in a tenth of the time | `separable` |
-| a lens found from an image | `fit.dof`, through `layered` or `scatter` |
+| a preview in a tenth of the time, 0.5 to 11 dB below `layered` | `separable` |
+| a lens found from an image | `fit.dof(..., effect="layered")` |
 | parameters fitted to a scene, second derivatives | `scatter` |
 | the multi-pass reference of a renderer | `accumulate` |
 | methods of the literature, for comparison | `gather`, `blend`, `depth_sorted`, |

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxfx import FocusPlanes, ThinLens, dof
+from jaxfx import FocusPlanes, ThinLens, dof, metrics, relight, scene
 
 
 def clamp(t):
@@ -76,3 +76,28 @@ def test_a_negative_epsilon_is_named():
     image, depth = np.ones((3, 3, 1)), np.ones((3, 3))
     with pytest.raises(ValueError, match=r"`separable\(epsilon=...\)` must be 0 or positive"):
         inspect.unwrap(dof.separable)(image, depth, ThinLens(1.0, 2.0, 3.0), epsilon=-1.0)
+
+
+@pytest.mark.full
+def test_before_an_empty_background_it_lies_far_below_layered():
+    trimesh = pytest.importorskip("trimesh", reason="pip install -e '.[scene]'")
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    shades = np.random.default_rng(0).random((len(sphere.vertices), 3)) * 255
+    sphere.visual = trimesh.visual.ColorVisuals(sphere, vertex_colors=shades.astype(np.uint8))
+    mesh = scene.from_trimesh(sphere)
+    camera = scene.default_camera(mesh, height=120, width=160)
+    lights = scene.default_lights(camera)
+
+    def seen_by(camera):
+        gbuffer = scene.gbuffer(mesh, camera, height=120, width=160)
+        return relight.render(gbuffer, camera, lights), gbuffer.depth
+
+    image, depth = seen_by(camera)
+    near = float(depth.min())
+    lens = ThinLens.from_camera(camera, aperture=0.15 * near, focus_distance=1.02 * near)
+    reference = dof.accumulate(lambda at: seen_by(at)[0], camera, lens, samples=128).image
+    layered, separable = (
+        float(metrics.psnr(effect(image, depth, lens), reference))
+        for effect in (dof.layered, dof.separable)
+    )
+    assert 10 < layered - separable < 13
