@@ -3,8 +3,8 @@
     python -m benchmarks.depth_errors
 
 Prints a table. The still life is in focus at its near objects, as a portrait is; the reference
-looks through 256 points of the lens. Figures are errors of the image's values, root mean square,
-within 8 pixels of the edges in depth.
+looks through 256 points of the lens. Figures are errors of the image's values, root mean
+square, within 8 pixels of the edges in depth.
 """
 
 import numpy as np

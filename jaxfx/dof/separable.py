@@ -40,9 +40,9 @@ def separable(
 ) -> Float[Array, "height width channel"]:
     """Depth of field by two one-dimensional passes, along rows, then along columns: a preview.
 
-    It comes within 0.5 dB of `layered` for a tenth of its time on the still life, and lies 11 dB
-    below it on a sphere before an empty background. A highlight becomes a square, and corners
-    of silhouettes leak.
+    It comes within 0.5 dB of `layered` for a tenth of its time on the still life, and lies 11
+    dB below it on a sphere before an empty background. A highlight becomes a square, and
+    corners of silhouettes leak.
 
     **Arguments:**
 
