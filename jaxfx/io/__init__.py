@@ -2,7 +2,7 @@
 
 | I want | call |
 |---|---|
-| an image from PNG, JPEG or EXR | `read_color` |
+| an image from PNG, JPEG, EXR or Radiance (`.hdr`) | `read_color` |
 | a depth or disparity from PNG, EXR, PFM, NPY or NPZ | `read_depth`, then `jaxfx.depth` |
 | an 8-bit PNG to look at | `write_png` |
 | PNG alone | `read_png` |

@@ -1,4 +1,7 @@
-"""Images from PNG, JPEG and EXR files, in linear light. `jaxfx.scene` uses `jpeg_values`."""
+"""Images from PNG, JPEG, EXR and Radiance files, in linear light.
+
+`jaxfx.scene` uses `jpeg_values`.
+"""
 
 from io import BytesIO
 from pathlib import Path
@@ -11,6 +14,7 @@ from jaxfx._extras import needs
 from jaxfx._files import StrPath
 from jaxfx.exr.rgbd import choose_image, images_of
 from jaxfx.io.png import decode_png
+from jaxfx.io.radiance import SIGNATURES, decode_radiance
 from jaxfx.io.srgb import linear_from_srgb, log_profile
 
 
@@ -35,14 +39,14 @@ _ORIENTATION = 0x0112
 def read_color(
     path: StrPath, *, layer: str | None = None
 ) -> Float[np.ndarray, "height width channel"]:
-    """Read an image from a PNG, JPEG or EXR file into linear light.
+    """Read an image from a PNG, JPEG, EXR or Radiance (`.hdr`) file into linear light.
 
     The format is recognised by the file's first bytes, whatever its suffix.
 
     **Arguments:**
 
     - `path`: the file. PNG is read as by `read_png`; JPEG is taken for sRGB, and turned upright
-      by its Exif data; EXR is linear.
+      by its Exif data; EXR and Radiance are linear.
     - `layer`: the layer of an EXR file whose image is read, as for `exr.read_rgbd`. None takes
       the main image, or the only one.
 
@@ -72,8 +76,10 @@ def read_color(
         return decode_png(path, data)
     if data.startswith(JPEG):
         return _decode_jpeg(path, data)
+    if data.startswith(SIGNATURES):
+        return decode_radiance(path, data)
     got = f"one that begins with {data[:4]!r}" if data else "an empty one"
-    raise ValueError(f"`{path}` must be a PNG, JPEG or EXR file, got {got}.")
+    raise ValueError(f"`{path}` must be a PNG, JPEG, EXR or Radiance file, got {got}.")
 
 
 def _decode_jpeg(path: StrPath, data: bytes) -> np.ndarray:

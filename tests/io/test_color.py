@@ -107,7 +107,7 @@ def test_errors(tmp_path):
     with pytest.raises(FileNotFoundError):
         io.read_color(path)
     path.touch()
-    with pytest.raises(ValueError, match=r"a.jpg` must be a PNG, JPEG or EXR .* an empty one"):
+    with pytest.raises(ValueError, match=r"a.jpg` must be a PNG, .* an empty one"):
         io.read_color(path)
     path.write_bytes(b"GIF89a")
     with pytest.raises(ValueError, match=r"a.jpg` must be .* begins with b'GIF8'"):
