@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._numerics import clip01
 from jaxfx.dof.iris import Outline, chord
+from jaxfx.dof.kernels._span_painter import filled
 from jaxfx.dof.sprites import Sprites, leak_rejection, reach
 
 
@@ -105,11 +106,7 @@ def near_reach(epsilon: float, max_coc: float) -> int:
 
 
 def _paint(value, radius, side, layer, outline, far):
-    """The sums of the sprites of each of two layers.
-
-    With A the sum of all steps at the pixels that an end cuts, and B that of the fraction cut
-    times the step, the image is `running_sum(A) - B`.
-    """
+    """The sums of the sprites of each of two layers, by the steps of `_span_painter`."""
     height, width, values = value.shape
     rows, columns = height + 2 * far, width + 2 * far + 2
     y = jnp.arange(height)[:, None] + layer * rows + far
@@ -129,6 +126,5 @@ def _paint(value, radius, side, layer, outline, far):
 
     steps = jnp.zeros((2 * rows * columns, 2 * values), value.dtype)
     steps = jax.lax.scan(jax.checkpoint(add_row), steps, jnp.arange(-far, far + 1))[0]
-    steps = steps.reshape(2, rows, columns, 2 * values)
-    sums = jax.lax.cumsum(steps[..., :values], axis=2) - steps[..., values:]
+    sums = filled(steps.reshape(2, rows, columns, 2 * values), axis=2)
     return sums[:, far:, far + 1 :][:, :height, :width]

@@ -52,8 +52,8 @@ def _filled(extent: Extent, sheets: Sheets) -> Filling:
     grid = Grid(extent.reach, sheets)
     discs = grid.discs(sheets)
 
-    def add(index, order, count, state):
-        return fill(index, grid.paint(index, order, count, discs), state)
+    def add(index, is_held, state):
+        return fill(index, grid.paint(index, is_held, discs), state)
 
     return grid.each_slice(discs, add, nothing_filled(extent, sheets))
 
@@ -64,9 +64,9 @@ def _tangent(
     grid = Grid(extent.reach, sheets)
     discs, dots = grid.discs(sheets), grid.discs(sheets, dot)
 
-    def add(index, order, count, state):
+    def add(index, is_held, state):
         light, light_dot, late_dot = state
-        arriving, arriving_dot = jnp.split(grid.paint(index, order, count, discs, dots), 2)
+        arriving, arriving_dot = jnp.split(grid.paint(index, is_held, discs, dots), 2)
         allowed, weight, full = allowance(arriving, light)
         taken = light_dot[-1] + allowed * arriving_dot[-1]
         allowed_dot = jnp.where(full, -taken / jnp.where(full, arriving[-1], 1), 0)
@@ -76,7 +76,7 @@ def _tangent(
         late_dot = late_dot + weight[None] * found_dot + weight_dot[None] * found
         return light + found, light_dot + found_dot, late_dot
 
-    nothing = jnp.zeros((grid.values, grid.height, grid.width), sheets.value.dtype)
+    nothing = jnp.zeros(grid.shape, sheets.value.dtype)
     _, *found = grid.each_slice(discs, add, (nothing, nothing, nothing))
     return jnp.concatenate(found)
 
@@ -88,11 +88,11 @@ def _adjoint(
     reading = begin_reading(_filled(extent, sheets), bar)
     discs = grid.discs(sheets)
 
-    def read(index, order, count, state):
+    def read(index, is_held, state):
         bars, *carry = state
-        arriving = grid.paint(index, order, count, discs)
+        arriving = grid.paint(index, is_held, discs)
         seen, carry = read_slice(reading, index, arriving, tuple(carry))
-        return grid.read_back(index, order, count, discs, seen, bars), *carry
+        return grid.read_back(index, is_held, discs, seen, bars), *carry
 
     return grid.planes(grid.each_slice(discs, read, (jnp.zeros_like(discs), *reading.start))[0])
 
