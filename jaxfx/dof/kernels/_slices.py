@@ -127,7 +127,7 @@ class Grid:
         value, radius, tilt, place = dot or sheets
         by_taps, fill = jnp.zeros_like(place), 0.0
         if dot is None:
-            place = jnp.where(self._counts(sheets), ordered(place), jnp.inf)
+            place = jnp.where(self._is_painted(sheets), ordered(place), jnp.inf)
             by_taps = jax.vmap(too_bright)(value, radius).astype(place.dtype)
             fill = jnp.inf
         planes = [value, radius[:, None], tilt, place[:, None], by_taps[:, None]]
@@ -138,20 +138,18 @@ class Grid:
         planes, v = self.blocks.planes(discs), self.values
         return Sheets(planes[:, :v], planes[:, v], planes[:, v + 1 : v + 3], planes[:, v + 3])
 
-    def _counts(self, sheets: Sheets) -> Bool[Array, "sheet height width"]:
+    def _is_painted(self, sheets: Sheets) -> Bool[Array, "sheet height width"]:
         """Mask of the sprites that are not hidden in full and that reach the frame."""
-        outside = [
-            jnp.maximum(
-                jnp.abs(jnp.arange(n, dtype=sheets.radius.dtype) - (n - 1) / 2)
-                - (n - 1) / 2
-                + self.reach,
-                0,
-            )
-            for n in sheets.radius.shape[1:]
-        ]
-        rows, columns = outside
-        reaches = rows[None, :, None] < sheets.radius + 0.5
-        reaches &= columns[None, None, :] < 4 / 3 * sheets.radius + 0.5
+
+        def beyond_frame(size):
+            """The distance of each row or column from the frame, in pixels."""
+            from_middle = jnp.abs(jnp.arange(size, dtype=sheets.radius.dtype) - (size - 1) / 2)
+            return jnp.maximum(from_middle - (size - 1) / 2 + self.reach, 0)
+
+        above, beside = map(beyond_frame, sheets.radius.shape[1:])
+        reaches = above[None, :, None] < sheets.radius + 0.5
+        # Along a row the tilt moves a span by up to a third of the radius.
+        reaches &= beside[None, None, :] < 4 / 3 * sheets.radius + 0.5
         return reaches & (sheets.value[:, -1] > 0)
 
     def each_slice(
@@ -185,13 +183,14 @@ class Grid:
         v = self.values
 
         def write_chunk(block, steps, ids, share, share_slope, tap):
-            disc = self._disc(discs, block, ids)
+            disc = self._disc(discs[block, ids])
             shared = disc._replace(value=disc.value * share[:, None])
             dot = None
             if dots is not None:
-                dot = self._disc(dots, block, ids)
+                rows = dots[block, ids]
+                dot = self._disc(rows)
                 value_dot = dot.value * share[:, None]
-                share_dot = share_slope * dots[block, ids, v + 3]
+                share_dot = share_slope * rows[:, v + 3]
                 dot = dot._replace(value=value_dot + disc.value * share_dot[:, None])
             # What belongs to another slice only fills up the chunk: its radius must not count.
             shared = shared._replace(radius=jnp.where(share > 0, disc.radius, 0))
@@ -219,7 +218,7 @@ class Grid:
 
         def read_block(block, steps, bars):
             def read_chunk(block, bars, ids, share, share_slope, tap):
-                disc = self._disc(discs, block, ids)
+                disc = self._disc(discs[block, ids])
                 disc = disc._replace(radius=jnp.where(share > 0, disc.radius, 0))
                 places = self.blocks.places(disc.value.dtype, ids, tap)
                 found = read(self.blocks, places, disc, steps)
@@ -233,9 +232,10 @@ class Grid:
 
         return self.blocks.read_back(is_held, read_block, bar, bars)
 
-    def _disc(self, discs, block, ids) -> Discs:
-        disc, v = discs[block, ids], self.values
-        return Discs(disc[:, :v], disc[:, v], (disc[:, v + 1], disc[:, v + 2]))
+    def _disc(self, rows: Float[Array, "disc plane"]) -> Discs:
+        """Some rows of `discs` without what belongs to slices."""
+        v = self.values
+        return Discs(rows[:, :v], rows[:, v], (rows[:, v + 1], rows[:, v + 2]))
 
     def _each_chunk(self, index, block, discs, visit, carry):
         """Fold `visit(block, carry, ids, share, share_slope, tap)` over a slice's discs.
