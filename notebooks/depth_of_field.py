@@ -69,32 +69,32 @@ def program(method):
 
 
 methods = {name: program(method) for name, method in dof_cases.methods().items()}
-pictures = {"pinhole": image, "reference": reference}
-pictures |= {name: method() for name, method in methods.items()}
+images = {"pinhole": image, "reference": reference}
+images |= {name: method() for name, method in methods.items()}
 
 
-def show(pictures, columns, size):
-    rows = -(-len(pictures) // columns)
+def show(images, columns, size):
+    rows = -(-len(images) // columns)
     _, axes = plt.subplots(
         rows, columns, figsize=(size * columns, (size + 0.3) * rows), layout="constrained"
     )
     for ax in axes.flat:
         ax.set_axis_off()
-    for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
-        screen = io.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
+    for ax, (title, shown) in zip(axes.flat, images.items(), strict=False):
+        screen = io.srgb_from_linear(np.clip(np.asarray(shown), 0, 1))
         ax.imshow(screen, interpolation="nearest")
         ax.set_title(title, fontsize=9)
     plt.show()
 
 
-show(pictures, columns=5, size=2.3)
+show(images, columns=5, size=2.3)
 
 # %% [markdown]
 # Nearer: the rods before the focus, whose blur should let the room shine through.
 
 # %%
 crop = (slice(16, 88), slice(10, 82))
-show({name: picture[crop] for name, picture in pictures.items()}, columns=5, size=2.3)
+show({name: shown[crop] for name, shown in images.items()}, columns=5, size=2.3)
 
 # %% [markdown]
 # What each computes, of the pixel $q$:
@@ -298,15 +298,15 @@ for row, name in enumerate(names):
             lambda *data, name=name: getattr(dof, name)(*data, max_coc=dof_cases.MAX_COC),
             compiler_options={"xla_backend_optimization_level": 0},
         )
-    for column, (case, one) in enumerate(cases.items()):
+    for column, (case, example) in enumerate(cases.items()):
         if name == "accumulate":
-            picture = one.accumulated(128)
+            blurred = example.accumulated(128)
         else:
-            picture = method(*one.through(dof_cases.CAMERA), one.lens)
+            blurred = method(*example.through(dof_cases.CAMERA), example.lens)
         left, right = axes[row, 2 * column : 2 * column + 2]
-        left.imshow(picture[12:-12, :, 0], cmap="gray", vmin=0, vmax=1)
-        right.plot(one.truth, color="0.6", linewidth=2.5)
-        right.plot(picture[dof_cases.MIDDLE, :, 0], color="C3", linewidth=1)
+        left.imshow(blurred[12:-12, :, 0], cmap="gray", vmin=0, vmax=1)
+        right.plot(example.truth, color="0.6", linewidth=2.5)
+        right.plot(blurred[dof_cases.MIDDLE, :, 0], color="C3", linewidth=1)
         right.set(xticks=[], yticks=[], ylim=(-0.08, 1.08))
         left.set(xticks=[], yticks=[])
         if row == 0:
