@@ -173,7 +173,7 @@ slider_of = lambda value, low, high: widgets.FloatSlider(value, min=low, max=hig
 sliders = {
     "x": slider_of(0.3, -1.5, 1.5),
     "y": slider_of(1.1, 0.2, 2.0),
-    "z": slider(-1.8, -3.5, -0.5),
+    "z": slider_of(-1.8, -3.5, -0.5),
     "strength": slider_of(2.0, 0.0, 6.0),
 }
 view = widgets.Image(format="jpeg")
