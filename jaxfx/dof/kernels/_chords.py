@@ -18,11 +18,8 @@ from jaxtyping import Array, Float, Num
 from jaxfx._numerics import clip01
 from jaxfx.dof.iris import Outline, chord
 from jaxfx.dof.kernels._span_painter import filled
+from jaxfx.dof.kernels._taps import UNCOUPLED
 from jaxfx.dof.sprites import Sprites, leak_rejection, reach
-
-
-# From this many epsilons on, the leak rejection no longer depends on the source.
-_UNCOUPLED = 3.0
 
 
 class Shaped(NamedTuple):
@@ -90,7 +87,7 @@ def painted(shaped: Shaped, far: int, near: int) -> Float[Array, "height width v
     of all others depends on the target alone.
     """
     (value, radius, leak, coc, epsilon), side, outline = shaped
-    is_coupled = (leak >= 0) & (coc < _UNCOUPLED * epsilon)
+    is_coupled = (leak >= 0) & (coc < UNCOUPLED * epsilon)
     coupled = jnp.where(is_coupled[..., None], value, 0)
     close = Sprites(coupled, jnp.where(is_coupled, radius, 1), leak, coc, epsilon)
     sums = taps(Shaped(close, side, outline), near)
@@ -102,7 +99,7 @@ def painted(shaped: Shaped, far: int, near: int) -> Float[Array, "height width v
 
 def near_reach(epsilon: float, max_coc: float) -> int:
     """How far the sprites go that `painted` hands to `taps`, in pixels."""
-    return reach(min(max_coc, _UNCOUPLED * epsilon))
+    return reach(min(max_coc, UNCOUPLED * epsilon))
 
 
 def _paint(value, radius, side, layer, outline, far):

@@ -54,8 +54,8 @@ def _add_slice(state, arrived):
     """Put what finds room of a slice into the lens, and the same weighted."""
     light, late = state
     allowed, weight, _ = allowance(arrived, light)
-    found = allowed[None] * arrived
-    return (light + found, late + weight[None] * found), None
+    added = allowed[None] * arrived
+    return (light + added, late + weight[None] * added), None
 
 
 def _arriving(

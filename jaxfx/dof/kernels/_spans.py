@@ -21,12 +21,10 @@ from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels import _tiles
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
 from jaxfx.dof.kernels._span_painter import Blocks, Discs, read, too_bright, write
-from jaxfx.dof.kernels._taps import Planes, inside, to_planes
+from jaxfx.dof.kernels._taps import UNCOUPLED, Planes, inside, to_planes
 from jaxfx.dof.sprites import POINT_RADIUS, Sprites
 
 
-# From this many epsilons on, the leak rejection no longer depends on the source.
-_UNCOUPLED = 3.0
 # Height and width of a block in pixels: enough discs to spread the overhead of a row; their
 # steps fill a megabyte at a radius of 64. Larger blocks do not fit into a core's cache.
 BLOCK = (32, 128)
@@ -42,7 +40,7 @@ def _parts(
 ) -> tuple[Bool[Array, "height width"], Planes, list[Float[Array, "height width"]]]:
     """Which sprites go by tiles; those; the radii of the others before and behind the focus."""
     value, radius, leak, coc = planes
-    direct = (coc < _UNCOUPLED) | too_bright(value, radius)
+    direct = (coc < UNCOUPLED) | too_bright(value, radius)
     near = Planes(
         jnp.where(direct[None], value, 0), jnp.where(direct, radius, POINT_RADIUS), leak, coc
     )
