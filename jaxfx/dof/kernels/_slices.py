@@ -254,18 +254,18 @@ class Grid:
             ids = jnp.zeros(size + chunk, int).at[at].set(jnp.arange(size), mode="drop")
             count = held.sum()
 
-            def each(n, carry):
-                mine = jax.lax.dynamic_slice_in_dim(ids, n * chunk, chunk)
-                there = jnp.repeat(n * chunk + jnp.arange(chunk) < count, taps)
-                mine = jnp.repeat(mine, taps)
-                away = beyond[mine]
-                of_slice, slope = (
-                    jnp.where(there, f(away), 0) for f in (share_of, share_slope_of)
+            def visit_chunk(n, carry):
+                chunk_ids = jax.lax.dynamic_slice_in_dim(ids, n * chunk, chunk)
+                is_disc = jnp.repeat(n * chunk + jnp.arange(chunk) < count, taps)
+                chunk_ids = jnp.repeat(chunk_ids, taps)
+                share, share_slope = (
+                    jnp.where(is_disc, f(beyond[chunk_ids]), 0)
+                    for f in (share_of, share_slope_of)
                 )
                 tap = None if column is None else jnp.tile(column, chunk)
-                return visit(block, carry, mine, of_slice, slope, tap)
+                return visit(block, carry, chunk_ids, share, share_slope, tap)
 
-            return fori_loop(0, -(-count // chunk), each, carry)
+            return fori_loop(0, -(-count // chunk), visit_chunk, carry)
 
         held = share_of(beyond) > 0
         carry = fold(carry, held & ~bright, CHUNK, None)

@@ -143,7 +143,7 @@ class Blocks:
         planes = planes.reshape(*planes.shape[:2], down * tall, across * wide)
         return planes[..., : self.size[0], : self.size[1]]
 
-    def hold(self, radius: Float[Array, "height width"]) -> Bool[Array, " block"]:
+    def are_held(self, radius: Float[Array, "height width"]) -> Bool[Array, " block"]:
         """Mask of the blocks that hold discs."""
         (down, across), (tall, wide) = self.counts, self.block
         blocks = self.whole(radius).reshape(down, tall, across, wide)

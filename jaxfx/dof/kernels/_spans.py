@@ -74,7 +74,7 @@ def paint(
         moved = moved._replace(value=jnp.where(there, moved.value, 0))
         return write(blocks, places, discs, steps, moved, tangent_only=True)
 
-    return blocks.paint(blocks.hold(radius), write_block, (1, len(value)), value.dtype)
+    return blocks.paint(blocks.are_held(radius), write_block, (1, len(value)), value.dtype)
 
 
 def read_back(
@@ -99,7 +99,7 @@ def read_back(
         return [blocks.added(x, block, y) for x, y in zip(bars, found, strict=True)]
 
     found = [*map(blocks.whole, (bars[0], bars[1][None]))]
-    found = blocks.read_back(blocks.hold(radius), read_block, bar, found, weight)
+    found = blocks.read_back(blocks.are_held(radius), read_block, bar, found, weight)
     height, width = radius.shape
     value_bar, radius_bar = (x[:, :height, :width] for x in found)
     return value_bar, radius_bar[0]
