@@ -95,8 +95,8 @@ def _axes(*trees: Any) -> frozenset[str]:
     """All axes over which a leaf of the trees varies."""
 
     def axes(leaf: Any) -> frozenset[str]:
-        known: Any = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
-        return known.manual_axis_type.varying
+        shape: Any = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
+        return shape.manual_axis_type.varying
 
     return frozenset[str]().union(*map(axes, jax.tree.leaves(trees)))
 

@@ -3,9 +3,10 @@
 `jit(vmap(f))` of a batch that is sharded along its first axis runs on every device over the
 device's own members. Two things stand in the way. XLA can't divide a loop over the members of a
 batch, or a loop that ends with its data, and would gather the batch on every device: the rules
-of `_platform` for batches use `each_device`, which divides it by hand. And a mesh of
-`AxisType.Explicit`, which `jax.make_mesh` makes by default, asks for the sharding of many
-an index and reshape: `on_any_mesh` leaves these to XLA, as on a mesh of `AxisType.Auto`.
+of `_platform` for batches use `each_device`, which divides it by hand. And on a
+mesh of `AxisType.Explicit`, which `jax.make_mesh` makes by default, JAX raises an error where a
+program indexes or reshapes without saying how the result is sharded: `on_any_mesh` leaves that
+to XLA, as on a mesh of `AxisType.Auto`.
 """
 
 import functools as ft
@@ -92,8 +93,8 @@ def each_device(
         def part(*leaves):  # Traced again: it has fewer members.
             return jax.tree.leaves(of_leaves(*leaves[: tree.num_leaves]))
 
-        found = _divided(whole, part, levels_of)(*leaves, *traced.consts)
-        return jax.tree.unflatten(jax.tree.structure(shapes), found)
+        results = _divided(whole, part, levels_of)(*leaves, *traced.consts)
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return divided
 
@@ -111,9 +112,11 @@ def _divided(
     def partition(mesh, operands, results):
         specs = [_entries(operand) for operand in operands]
         of_results = [_entries(result) for result in jax.tree.leaves(results)]
-        sharded = _by_level(specs, axes_of, depth)
-        sharded = _by_level(of_results, [list(range(depth))] * len(of_results), depth, sharded)
-        placed = lambda axes: NamedSharding(mesh, PartitionSpec(*(sharded[k] for k in axes)))
+        # As the operands are sharded; where none of them is, as XLA asks for the results.
+        mesh_axes = _by_level(specs, axes_of, depth)
+        all_levels = [list(range(depth))] * len(of_results)
+        mesh_axes = _by_level(of_results, all_levels, depth, mesh_axes)
+        placed = lambda axes: NamedSharding(mesh, PartitionSpec(*(mesh_axes[k] for k in axes)))
         of_batches = jax.tree.map(lambda _: placed(range(depth)), results)
         return mesh, part, of_batches, tuple(map(placed, axes_of))
 
@@ -140,10 +143,14 @@ def _entries(operand: Any) -> tuple:
 
 
 def _by_level(specs, axes_of, depth: int, before: Sequence = ()) -> list:
-    """Of each level of batches, the mesh's axes over which the first sharded leaf has it."""
-    sharded = list(before) or [None] * depth
-    for spec, axes in zip(specs, axes_of, strict=True):
-        for entry, level in zip(spec, axes, strict=False):
-            if entry is not None and sharded[level] is None and entry not in sharded:
-                sharded[level] = entry
-    return sharded
+    """Of each level of batches, the mesh's axes over which the first sharded leaf has it.
+
+    `before` has those of levels for which they are decided already, None for the others. No
+    axis of the mesh serves two levels.
+    """
+    mesh_axes = list(before) or [None] * depth
+    for spec, levels in zip(specs, axes_of, strict=True):
+        for entry, level in zip(spec, levels, strict=False):
+            if entry is not None and mesh_axes[level] is None and entry not in mesh_axes:
+                mesh_axes[level] = entry
+    return mesh_axes

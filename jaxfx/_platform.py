@@ -67,19 +67,20 @@ def of_batches(
             return cpu(*operands)
         return by_platform(*operands, cpu=cpu, accelerator=accelerator)
 
-    one = custom_vmap(each_device(chosen, levels) if levels else chosen)
+    unbatched = custom_vmap(each_device(chosen, levels) if levels else chosen)
     rule = rule_on_cpu or _in_turn
 
-    @one.def_vmap
+    @unbatched.def_vmap
     def batch(_size, is_batched, *operands):
         on_cpu, elsewhere = rule(cpu, is_batched), _at_once(accelerator, is_batched)
         if rule is _at_once and cpu is accelerator:
+            # The same object, so that `chosen` sees that one program serves both.
             elsewhere = on_cpu
-        more = (jax.tree.leaves(is_batched), *levels)
-        out = of_batches(on_cpu, elsewhere, more, rule_on_cpu)(*operands)
+        all_levels = (jax.tree.leaves(is_batched), *levels)
+        out = of_batches(on_cpu, elsewhere, all_levels, rule_on_cpu)(*operands)
         return out, jax.tree.map(lambda _: True, out)
 
-    return one
+    return unbatched
 
 
 def either(
@@ -90,33 +91,36 @@ def either(
 ) -> Any:
     """`short(*operands)` where `predicate(*operands)`, else `long(*operands)`, and that alone.
 
-    A batch goes one by one on a CPU. On an accelerator, where to look at a predicate takes as
-    long as a few launches, it is looked at once: where it holds for all, all take `short`.
+    On a CPU each member of a batch takes its own branch. On an accelerator a branch waits for
+    its predicate, for as long as a few launches take: there is one branch for the whole batch.
+    If the predicate holds for all members, all take `short`; else both functions are computed
+    and each member's result is selected.
     """
     return _either(predicate, short, long)(*operands)
 
 
 def _either(predicate, short, long) -> Callable[..., Any]:
     choose = lambda *operands: cond(predicate(*operands), short, long, *operands)
-    one = custom_vmap(choose)
+    unbatched = custom_vmap(choose)
 
-    @one.def_vmap
+    @unbatched.def_vmap
     def batch(_size, is_batched, *operands):
-        asks, shorts, longs = (_at_once(f, is_batched) for f in (predicate, short, long))
-        ask_all = lambda *operands: asks(*operands).all()
+        predicates, shorts, longs = (_at_once(f, is_batched) for f in (predicate, short, long))
+        holds_for_all = lambda *operands: predicates(*operands).all()
 
-        def each(*operands):
+        def selected(*operands):
             # Not by a `cond`: what it closes over then has a batch axis too.
             select = jax.vmap(
-                lambda asked, *two: jax.tree.map(ft.partial(jnp.where, asked), *two)
+                lambda holds, *pair: jax.tree.map(ft.partial(jnp.where, holds), *pair)
             )
-            return select(asks(*operands), shorts(*operands), longs(*operands))
+            return select(predicates(*operands), shorts(*operands), longs(*operands))
 
-        in_turn, together = _in_turn(choose, is_batched), _either(ask_all, shorts, each)
+        in_turn = _in_turn(choose, is_batched)
+        together = _either(holds_for_all, shorts, selected)
         out = of_batches(in_turn, together, (jax.tree.leaves(is_batched),))(*operands)
         return out, jax.tree.map(lambda _: True, out)
 
-    return one
+    return unbatched
 
 
 def _in_turn(function: Callable[..., Any], is_batched: Any) -> Callable[..., Any]:
@@ -126,10 +130,13 @@ def _in_turn(function: Callable[..., Any], is_batched: Any) -> Callable[..., Any
     def loop(*operands):
         leaves, tree = jax.tree.flatten(operands)
 
-        def member(moving):
-            moving = iter(moving)
-            every = [next(moving) if m else x for x, m in zip(leaves, mapped, strict=True)]
-            return function(*jax.tree.unflatten(tree, every))
+        def member(mapped_leaves):
+            of_member = iter(mapped_leaves)
+            operands = [
+                next(of_member) if has_batch else leaf
+                for leaf, has_batch in zip(leaves, mapped, strict=True)
+            ]
+            return function(*jax.tree.unflatten(tree, operands))
 
         return jax.lax.map(member, [x for x, m in zip(leaves, mapped, strict=True) if m])
 
@@ -138,4 +145,6 @@ def _in_turn(function: Callable[..., Any], is_batched: Any) -> Callable[..., Any
 
 def _at_once(function: Callable[..., Any], is_batched: Any) -> Callable[..., Any]:
     """`function` of batches, of all members together."""
-    return jax.vmap(function, jax.tree.map(lambda moves: 0 if moves else None, is_batched))
+    return jax.vmap(
+        function, jax.tree.map(lambda has_batch: 0 if has_batch else None, is_batched)
+    )

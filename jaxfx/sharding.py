@@ -29,6 +29,7 @@ class _Layout(NamedTuple):
     """Which rows of an image each device has and sees: numbers of rows, and of a first row.
 
     - `share`: the rows of each device; the last ones may have fewer, or none.
+    - `halo`: the rows that each device gets from either neighbour.
     - `window`: the rows that each device sees, its own among them.
     - `starts`: of each device, where its window begins in the image.
     """
@@ -120,8 +121,8 @@ def rows(
         divided = jax.shard_map(
             part, mesh=devices, in_specs=(spread, PartitionSpec()), out_specs=spread
         )
-        found = divided(_placed(filled, devices, spread), arrays)
-        return _cut(found, devices, height, count * layout.share)
+        results = divided(_placed(filled, devices, spread), arrays)
+        return _cut(results, devices, height, count * layout.share)
 
     return call
 

@@ -34,14 +34,14 @@ from jaxfx import _sampling, blur, io, relight, scene
 plt.rcParams.update({"figure.dpi": 80, "savefig.dpi": 80})
 
 
-def show(pictures, columns=3, **options):
-    rows = -(-len(pictures) // columns)
+def show(images, columns=3, **options):
+    rows = -(-len(images) // columns)
     size = (2.3 * columns, 2.5 * rows)
     _, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
-    for ax, (title, picture) in zip(axes.flat, pictures.items(), strict=False):
-        ax.imshow(io.srgb_from_linear(np.clip(picture, 0, 1)), **options)
+    for ax, (title, shown) in zip(axes.flat, images.items(), strict=False):
+        ax.imshow(io.srgb_from_linear(np.clip(shown, 0, 1)), **options)
         ax.set_title(title)
     plt.show()
 

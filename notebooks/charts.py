@@ -15,8 +15,8 @@
 # # Charts: one method against the other
 #
 # Every method of every effect, measured in one run on one machine. Left is cheap, up is exact.
-# What has nothing both left of it and above it is filled and on the grey *Pareto front*; what
-# is beaten is hollow, and stays.
+# A method that no other beats in both is filled and on the grey *Pareto front*; the others are
+# hollow, and are kept for comparison.
 
 # %%
 import functools
@@ -57,11 +57,11 @@ show("dof_time_still_life", "dof_time_fence")
 # Depth of field, given an image and its depth; multi-pass alone sees the scene.
 #
 # - **Read along the front.** Each step up must be paid for. `blend` is the cheapest; the
-#   kernels of `scatter` are one method at several prices, in one row; `layered` with a second
+#   programs of `scatter` are one method at several prices, in one row; `layered` with a second
 #   layer of depth is as exact as some thirty passes, for a tenth of their time.
 # - **The scenes disagree**, and the second is there for that. Behind a fence out of focus lies
-#   what no single image holds: one layer, scatter and all of their kin end within four
-#   decibels of one another, and only a second layer or more passes get further.
+#   what no single image holds: methods of one layer end within four decibels of one another,
+#   and only a second layer or more passes get further.
 # - **More effort is no less error** for `gather`: more taps draw the same wrong disc more
 #   finely.
 # - **A plan is a point that was chosen by probing**: its number is the error that it may make
@@ -123,13 +123,13 @@ methods = {
     **{f"gather {taps}": compiled(dof.gather, taps=taps) for taps in (8, 32)},
 }
 reference = compiled(dof.layered)()
-found = [tradeoff.measure(methods, reference, progress=False) for _ in range(3)]
+runs = [tradeoff.measure(methods, reference, progress=False) for _ in range(3)]
 figure, axes = plt.subplots(1, 3, figsize=(12, 4), sharey=True, layout="constrained")
-for ax, measurements in zip(axes, found, strict=True):
+for ax, measurements in zip(axes, runs, strict=True):
     tradeoff.plot(measurements, ax, lines={"gather": ["gather 8", "gather 32"]})
 display(figure)
 plt.close(figure)
-for times in zip(*found, strict=True):
+for times in zip(*runs, strict=True):
     seconds = [m.seconds for m in times]
     print(f"{times[0].name:10} medians differ by {max(seconds) / min(seconds) - 1:4.0%}")
 
@@ -149,11 +149,11 @@ edges = np.zeros(depth.shape, bool)
 edges[1:, 1:] = step > 0.02
 print(f"{'':12}{'PSNR':>8}{'at edges':>10}{'SSIM':>8}")
 for name, method in methods.items():
-    picture = method()
-    near = metrics.psnr(picture, reference, mask=edges)
+    blurred = method()
+    at_edges = metrics.psnr(blurred, reference, mask=edges)
     print(
-        f"{name:12}{float(metrics.psnr(picture, reference)):8.1f}{float(near):10.1f}"
-        f"{float(metrics.ssim(picture, reference)):8.3f}"
+        f"{name:12}{float(metrics.psnr(blurred, reference)):8.1f}{float(at_edges):10.1f}"
+        f"{float(metrics.ssim(blurred, reference)):8.3f}"
     )
 
 # %% [markdown]

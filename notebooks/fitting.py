@@ -48,11 +48,9 @@ camera = scene.default_camera(room, **SIZE)
 gbuffer = scene.gbuffer(room, camera, **SIZE)
 
 
-def show(**pictures):
-    _, axes = plt.subplots(
-        1, len(pictures), figsize=(4 * len(pictures), 3.2), layout="constrained"
-    )
-    for axis, (name, image) in zip(axes, pictures.items(), strict=True):
+def show(**images):
+    _, axes = plt.subplots(1, len(images), figsize=(4 * len(images), 3.2), layout="constrained")
+    for axis, (name, image) in zip(axes, images.items(), strict=True):
         axis.imshow(np.clip(io.srgb_from_linear(np.asarray(image)), 0, 1))
         axis.set(title=name.replace("_", " "), xticks=[], yticks=[])
     plt.show()
@@ -63,8 +61,8 @@ def show(**pictures):
 #
 # An image under lights $i$ of colour $c_i$ and geometry $\theta_i$ is $I = \sum_i c_i\,
 # B_i(\theta_i)$: linear in the colours. So the colours are never searched. For any geometry
-# the best are the solution of a small linear system, and Levenberg-Marquardt walks over the
-# geometry alone:
+# the best are the solution of a small linear system, and Levenberg-Marquardt searches
+# the geometry alone:
 #
 # $$\min_\theta \big\lVert \sum_i c_i^\star(\theta)\, B_i(\theta_i) - I_{ref} \big\rVert^2,
 # \qquad
@@ -91,10 +89,12 @@ show(
 )
 
 # %%
-for found, true in zip(fitted.lights, truth, strict=True):
-    print(type(found).__name__)
-    for name in vars(true):
-        value, wanted = (np.asarray(getattr(light, name)) for light in (found, true))
+for fitted_light, true_light in zip(fitted.lights, truth, strict=True):
+    print(type(fitted_light).__name__)
+    for name in vars(true_light):
+        value, wanted = (
+            np.asarray(getattr(light, name)) for light in (fitted_light, true_light)
+        )
         if name == "direction":
             wanted = wanted / np.linalg.norm(wanted)
         print(f"  {name:12} {np.round(value, 3)!s:24} of {np.round(wanted, 3)}")
@@ -108,9 +108,11 @@ print(f"{len(fitted.losses)} losses, from {fitted.losses[0]:.1e} to {fitted.loss
 
 # %%
 suns = [truth[0], AmbientLight(white), truth[0]]
-picture = relight.render(gbuffer, camera, suns)
-told = fit.lights(picture, gbuffer, camera, suns, parameters=("color",), throw=False)
-print(told.indistinct, told.doubt)
+photograph_of_suns = relight.render(gbuffer, camera, suns)
+ambiguous = fit.lights(
+    photograph_of_suns, gbuffer, camera, suns, parameters=("color",), throw=False
+)
+print(ambiguous.indistinct, ambiguous.doubt)
 
 # %% [markdown]
 # ## A sun by its shadow
@@ -170,7 +172,7 @@ corners = [
     [[-1.2, 0, 0.3], [-0.7, 0.5, 1.0]],
     [[0.6, 0, -1.1], [1.3, 0.3, -0.9]],
 ]
-boxes = [trimesh.creation.box(bounds=each) for each in corners]
+boxes = [trimesh.creation.box(bounds=box_corners) for box_corners in corners]
 boxes = scene.from_trimesh(trimesh.util.concatenate(boxes))
 down = np.array([[1.0, 0, 0, 0], [0, 0, -1, 5], [0, 1, 0, 0], [0, 0, 0, 1]])
 above = OrthographicCamera(16.0, jnp.array([48.0, 36.0]), down)
@@ -206,11 +208,11 @@ def loss(angle, visibility):
     ]
     matrix = np.stack(parts, axis=-1).reshape(-1, 3, 2).astype(float)
     right = np.asarray(target, float).reshape(-1, 3)
-    miss = [
+    residuals = [
         right[:, c] - matrix[:, c] @ np.linalg.lstsq(matrix[:, c], right[:, c])[0]
         for c in range(3)
     ]
-    return np.mean(np.square(miss))
+    return np.mean(np.square(residuals))
 
 
 def plot(axis, angles, **kinds):
@@ -222,7 +224,7 @@ def plot(axis, angles, **kinds):
     axis.legend()
 
 
-def seen(angle):
+def sun_at(angle):
     return DirectionalLight(turned(angle), white)
 
 
@@ -231,15 +233,15 @@ plot(
     far,
     np.linspace(-40, 40, 17),
     hard=lambda angle: hard(table, turned(angle)),
-    soft_at_10=lambda angle: soft(table, turned(angle), 10.0)(seen(angle)),
-    soft_at_40=lambda angle: soft(table, turned(angle), 40.0)(seen(angle)),
+    soft_at_10=lambda angle: soft(table, turned(angle), 10.0)(sun_at(angle)),
+    soft_at_40=lambda angle: soft(table, turned(angle), 40.0)(sun_at(angle)),
 )
-once = soft(table, turned(2.0), 40.0)
+soft_by_one_map = soft(table, turned(2.0), 40.0)
 plot(
     near,
     np.linspace(1.85, 2.15, 21),
     hard=lambda angle: hard(table, turned(angle)),
-    soft_at_40_map_made_once=lambda angle: once(seen(angle)),
+    soft_at_40_map_made_once=lambda angle: soft_by_one_map(sun_at(angle)),
 )
 plt.show()
 
@@ -258,8 +260,10 @@ wrong = DirectionalLight(tilt @ turned(8.0), sun.color)
 
 
 def degrees_off(light):
-    one, other = (each.direction / jnp.linalg.norm(each.direction) for each in (light, sun))
-    return float(jnp.degrees(jnp.arccos(one @ other)))
+    direction, true_direction = (
+        x.direction / jnp.linalg.norm(x.direction) for x in (light, sun)
+    )
+    return float(jnp.degrees(jnp.arccos(direction @ true_direction)))
 
 
 def shadows(lights, index):

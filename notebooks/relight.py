@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Image as Picture, display
+from IPython.display import Image as StoredImage, display
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 from PIL import Image
 
@@ -46,7 +46,7 @@ plt.rcParams |= {"figure.dpi": 80, "font.size": 9, "axes.grid": True, "grid.alph
 show = lambda image: np.asarray(io.srgb_from_linear(np.clip(np.asarray(image), 0, 1)))
 
 
-def pictures(titled, columns, width=10):
+def show_titled(titled, columns, width=10):
     rows = -(-len(titled) // columns)
     _, axes = plt.subplots(
         rows, columns, figsize=(width, width / columns * rows * 0.86), layout="constrained"
@@ -64,7 +64,7 @@ mesh = scene.still_life()
 SIZE = {"height": 240, "width": 320}
 camera = scene.default_camera(mesh, **SIZE)
 gbuffer = scene.gbuffer(mesh, camera, **SIZE)
-pictures(
+show_titled(
     {
         "color": gbuffer.color,
         "shader": gbuffer.shader,
@@ -90,7 +90,7 @@ lights = [*scene.default_lights(camera), PointLight([0.5, 1.2, -1.5], [1.5, 0.6,
 state = relight.start(gbuffer, camera, lights)
 moved = state.edit(3, PointLight([-0.6, 1.3, -2.5], [0.4, 1.0, 2.5]))
 floor = (scene.material_ids(mesh, camera, **SIZE) == 0) & (gbuffer.shader >= 0)
-pictures(
+show_titled(
     {
         "four lights": state.image,
         "one of them edited": moved.image,
@@ -159,7 +159,7 @@ to_bytes = jax.jit(
 )
 
 
-def picture(x, y, z, strength):
+def jpeg_under(x, y, z, strength):
     """The image with the light there, as JPEG."""
     color = np.array([1.0, 0.85, 0.6], np.float32) * strength
     light = PointLight(np.array([x, y, z], np.float32), color)
@@ -169,23 +169,23 @@ def picture(x, y, z, strength):
     return stream.getvalue()
 
 
-slider = lambda value, low, high: widgets.FloatSlider(value, min=low, max=high, step=0.05)
+slider_of = lambda value, low, high: widgets.FloatSlider(value, min=low, max=high, step=0.05)
 sliders = {
-    "x": slider(0.3, -1.5, 1.5),
-    "y": slider(1.1, 0.2, 2.0),
-    "z": slider(-1.8, -3.5, -0.5),
-    "strength": slider(2.0, 0.0, 6.0),
+    "x": slider_of(0.3, -1.5, 1.5),
+    "y": slider_of(1.1, 0.2, 2.0),
+    "z": slider_of(-1.8, -3.5, -0.5),
+    "strength": slider_of(2.0, 0.0, 6.0),
 }
 view = widgets.Image(format="jpeg")
 
 
 def answer(_=None):
-    view.value = picture(**{name: each.value for name, each in sliders.items()})
+    view.value = jpeg_under(**{name: slider.value for name, slider in sliders.items()})
 
 
-for name, each in sliders.items():
-    each.description = name
-    each.observe(answer, "value")
+for name, slider in sliders.items():
+    slider.description = name
+    slider.observe(answer, "value")
 answer()
 times = []
 for value in np.linspace(-1, 1, 21):
@@ -199,19 +199,19 @@ widgets.VBox([view, *sliders.values()])
 # ## New views
 #
 # A pixel of the new view and its depth are a point of the world; each cache that sees it, by
-# depth, normal and shader, has its say; their mean is the new cache. What no cache sees is a
+# depth, normal and shader, is read; their mean is the new cache. What no cache sees is a
 # hole.
 
 # %%
 target, depth, gbuffers, cameras = relight_scenes.new_view((240, 320), 4)
-found, views = relight.synthesize(gbuffers, cameras, target, depth=depth)
-filled, count = relight.fill_holes(found, views)
+new_gbuffer, views = relight.synthesize(gbuffers, cameras, target, depth=depth)
+filled, count = relight.fill_holes(new_gbuffer, views)
 truth = scene.gbuffer(mesh, target, **SIZE)
 lights = scene.default_lights(target)
 image, filled_image, true_image = (
-    relight.render(each, target, lights) for each in (found, filled, truth)
+    relight.render(shaded, target, lights) for shaded in (new_gbuffer, filled, truth)
 )
-pictures(
+show_titled(
     {
         "how many caches see it": views,
         f"{int(count)} pixels of holes": image,
@@ -260,24 +260,24 @@ truths = [scene.gbuffer(mesh, target, **small_size) for target in targets]
 def scores(gbuffers, cameras, weighting="equal"):
     """PSNR of the relit image and the share of the view that is seen, at each angle."""
     for target, truth in zip(targets, truths, strict=True):
-        found, views = relight.synthesize(
+        new_gbuffer, views = relight.synthesize(
             gbuffers, cameras, target, depth=truth.depth, weighting=weighting
         )
-        filled, _ = relight.fill_holes(found, views)
+        filled, _ = relight.fill_holes(new_gbuffer, views)
         lights = scene.default_lights(target)
-        pair = (relight.render(each, target, lights) for each in (filled, truth))
-        seen = jnp.mean(views > 0) / jnp.mean(truth.shader >= 0)
-        yield float(metrics.psnr(*pair)), float(seen)
+        pair = (relight.render(shaded, target, lights) for shaded in (filled, truth))
+        seen_share = jnp.mean(views > 0) / jnp.mean(truth.shader >= 0)
+        yield float(metrics.psnr(*pair)), float(seen_share)
 
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained", sharex=True)
 for name, places in stations.items():
     cameras = [orbit(*place) for place in places]
-    gbuffers = [scene.gbuffer(mesh, each, **small_size) for each in cameras]
+    gbuffers = [scene.gbuffer(mesh, camera, **small_size) for camera in cameras]
     for number in (1, 4, 8) if name == "alike" else ():
-        score, seen = zip(*scores(gbuffers[:number], cameras[:number]), strict=True)
+        score, seen_share = zip(*scores(gbuffers[:number], cameras[:number]), strict=True)
         axes[0].plot(angles, score, ".-", label=f"{number}")
-        axes[1].plot(angles, seen, ".-", label=f"{number}")
+        axes[1].plot(angles, seen_share, ".-", label=f"{number}")
     for weighting, style in (("equal", ".-"), ("detail", "x:")):
         score, _ = zip(*scores(gbuffers[:4], cameras[:4], weighting), strict=True)
         color = "C2" if name == "alike" else "C4"
@@ -293,7 +293,7 @@ plt.show()
 # ## Why caches are not antialiased
 #
 # The mean of two surfaces' normals and depths is a third surface, between them. Sixteen samples
-# a pixel, averaged after shading and before:
+# per pixel, averaged after shading and before:
 
 # %%
 FINE = 4
@@ -317,17 +317,19 @@ averaged = {
 }
 antialiased = GBuffer(shader=middle(fine.shader), **averaged)
 supersampled = shrunk(relight.render(fine, fine_camera, lights))
-wrong = relight.render(antialiased, coarse_camera, lights)
-one = relight.render(scene.gbuffer(mesh, coarse_camera, **small_size), coarse_camera, lights)
+averaged_first = relight.render(antialiased, coarse_camera, lights)
+one_sample = relight.render(
+    scene.gbuffer(mesh, coarse_camera, **small_size), coarse_camera, lights
+)
 ids = scene.object_ids(mesh, fine_camera, **fine_size).reshape(120, FINE, 160, FINE)
 edges = jnp.max(ids, axis=(1, 3)) != jnp.min(ids, axis=(1, 3))
 score = lambda image: float(metrics.psnr(image, supersampled, mask=edges))
-pictures(
+show_titled(
     {
         "shaded, then averaged": supersampled,
-        f"averaged first: {score(wrong):.1f} dB at edges": wrong,
-        f"one sample: {score(one):.1f} dB at edges": one,
-        "averaging first: 4 times the error": 4 * jnp.abs(wrong - supersampled),
+        f"averaged first: {score(averaged_first):.1f} dB at edges": averaged_first,
+        f"one sample: {score(one_sample):.1f} dB at edges": one_sample,
+        "averaging first: 4 times the error": 4 * jnp.abs(averaged_first - supersampled),
     },
     4,
 )
@@ -342,7 +344,7 @@ pictures(
 # the next chart.
 
 # %%
-display(Picture(root / "docs/relight_truth.png"))
+display(StoredImage(root / "docs/relight_truth.png"))
 
 # %% [markdown]
 # ## One bounce
@@ -367,7 +369,7 @@ reached = lambda points: scene.visible(mesh, points, lamp.position)
 straight = relight.shade(bounce_cache, bounce_camera, lamp, reached(positions))
 lit = [reached(transfer.position)]
 bounced = relight.indirect(bounce_cache, transfer, [lamp], visibilities=lit)
-pictures(
+show_titled(
     {
         "direct": straight,
         "one bounce, 3 times": 3 * bounced,
@@ -375,7 +377,7 @@ pictures(
     },
     3,
 )
-display(Picture(root / "docs/relight_bounce.png"))
+display(StoredImage(root / "docs/relight_bounce.png"))
 
 # %% [markdown]
 # Against Mitsuba's paths of one bounce: the number of points decides the error, about one over
@@ -411,8 +413,8 @@ for side in (120, 240, 480):
         lit = [jnp.ones(size, jnp.float32)] * number
         state = relight.start(cached, at, lights, visibilities=lit)
         edit = median(lambda s=state, o=lights[0], v=lit[0]: s.edit(0, o, v).image, 5)
-        anew = lambda o=lights, c=at, s=size: relight_scenes.rendered_anew(mesh, c, o, s)
-        ratios.append(median(anew, 1, warm=number == 1) / edit)
+        from_mesh = lambda o=lights, c=at, s=size: relight_scenes.rendered_anew(mesh, c, o, s)
+        ratios.append(median(from_mesh, 1, warm=number == 1) / edit)
     ax.loglog(counts, ratios, ".-", label=f"{size[1]} x {size[0]}")
 ax.axhline(100, color="0.5", linestyle=":")
 ax.set(xlabel="lights with shadows", ylabel="times as fast")
@@ -422,7 +424,7 @@ plt.show()
 # %% [markdown]
 # ## What it cannot do
 #
-# - Reflections and refractions: a pixel knows one surface. Of the light that comes by way of
+# - Reflections and refractions: a pixel knows one surface. Of the light that comes from
 #   another surface, one diffuse bounce; it is coarse where surfaces nearly touch.
 # - Shadows of its own: `visibility` is the caller's, of `jaxfx.shadow` say.
 # - Transparency, motion blur, defocus: a cache is not antialiased. Take it finer, shade, then

@@ -52,8 +52,8 @@ def hatched(drawn, alpha):
     return np.where(np.asarray(alpha)[..., None] > 0, drawn, stripes[..., None])
 
 
-def show(ax, picture, title=""):
-    screen = io.srgb_from_linear(np.clip(np.asarray(picture), 0, 1))
+def show(ax, image, title=""):
+    screen = io.srgb_from_linear(np.clip(np.asarray(image), 0, 1))
     ax.imshow(screen, interpolation="nearest")
     ax.set_title(title, fontsize=9)
     ax.set_axis_off()
@@ -91,7 +91,7 @@ for level, ax in enumerate(axes):
 plt.show()
 
 # %% [markdown]
-# One ray on its way, step by step. A bar is the cell that it looks at: as wide as the cell, at
+# One ray, step by step. A bar is the cell that it looks at: as wide as the cell, at
 # the cell's depth. Where the ray reaches the bar it goes down two levels; where it leaves the
 # cell, to the next one, and up a level if it also leaves the cell two levels above. No ray
 # leaves a cell without looking at its neighbour: this is what makes the search exact.
@@ -102,10 +102,10 @@ place = np.arange(size) + 0.5
 profile = 0.75 + 0.1 * np.sin(place / 7)
 profile[21:23], profile[49:] = 0.3, 0.45
 field = jnp.asarray(np.broadcast_to(profile, (size, size)).copy())
-r = _crossings.grid_rays(jnp.array([[2.0, 31.5, 0.0]]), jnp.array([[60.0, 0.0, 0.62]]))
+ray = _crossings.grid_rays(jnp.array([[2.0, 31.5, 0.0]]), jnp.array([[60.0, 0.0, 0.62]]))
 tree = minimum_pyramid(field)
-begin = _crossings.entry_texel(r, size, size)
-left, up = _crossings.backward_axes(r)
+begin = _crossings.entry_texel(ray, size, size)
+left, up = _crossings.backward_axes(ray)
 state = _traversal.pack(begin.x, begin.y, jnp.array([len(tree.shapes) - 1]), left, up)
 step, cells = jax.jit(_traversal.step), []
 while True:
@@ -113,7 +113,7 @@ while True:
     if level >= _traversal.MISS:
         break
     cells.append((x >> level, level, float(tree.level(level)[y >> level, x >> level])))
-    state = step(tree, r, state)
+    state = step(tree, ray, state)
 
 figure, ax = plt.subplots(figsize=(11, 4), layout="constrained")
 ax.fill_between(place, profile, 1, step="mid", color="0.85")
@@ -144,7 +144,7 @@ plt.show()
 # a secant, `relief` equal steps and halvings: both step over what is thinner than a step. How
 # often their hit is wrong, by a texel or altogether, on a smooth field, on posts and gaps of a
 # texel, and at a cliff, from the front (no slope) to grazing (32 texels to a tenth of the
-# depth). The last row is their time. `pyramid` is never wrong: the tests hold it to a walk over
+# depth). The last row is their time. `pyramid` is never wrong: the tests hold it to a search of
 # every texel.
 
 # %%
@@ -169,12 +169,14 @@ figure, axes = plt.subplots(
 )
 for column, slope in enumerate(SLOPES):
     rays = cases.slanted_rays(FIELD, slope)
-    for row, (name, made) in enumerate(fields.items()):
+    for row, (name, depth_field) in enumerate(fields.items()):
         ax = axes[row, column]
         for method, counts in LINES.items():
-            rates = [100 * cases.error_rate(made, slope, method, count) for count in counts]
+            rates = [
+                100 * cases.error_rate(depth_field, slope, method, count) for count in counts
+            ]
             ax.plot(counts, rates, "o-", label=method)
-        steps = float(cases.run(made, *rays).steps.mean())
+        steps = float(cases.run(depth_field, *rays).steps.mean())
         ax.plot(steps, 0, "*", color="black", markersize=11, label="pyramid")
         ax.set_title(f"{name}, slope {slope}", fontsize=9)
         ax.grid(alpha=0.3)
@@ -200,9 +202,9 @@ axes[0, 0].legend(fontsize=8)
 plt.show()
 
 # %% [markdown]
-# The price of being exact: at a slant a ray looks at more texels, by the logarithm of its way.
-# Rays through hills with discs before them, the depth taken to be as deep as the image is
-# wide.
+# The price of being exact: at a slant a ray looks at more texels, by the logarithm of its
+# length. Rays through hills with discs before them, the depth taken to be as deep as the image
+# is wide.
 
 # %%
 angles, rows = (0, 10, 20, 30, 45, 60, 70, 80, 85), []
@@ -243,8 +245,8 @@ for degrees in (5, 10, 20, 40):
         "backward": cases.backward_warp(image, target_depth, source, target),
         "mesh": cases.trace(meshed, image, source, target, shape),
     }
-    for name, (picture, alpha) in drawn.items():
-        score = cases.scores(picture, alpha, truth, seen)
+    for name, (colors, alpha) in drawn.items():
+        score = cases.scores(colors, alpha, truth, seen)
         print(
             f"{degrees:4}° {name:10}{score['PSNR']:8.1f}{100 * score['false hits']:10.1f} %"
             f"{100 * score['false holes']:11.1f} %{100 * score['coverage']:8.1f} %"
@@ -317,8 +319,8 @@ print(f"{'sharp':12}{'':11}{float(metrics.psnr(sharp, reference)):8.2f} dB")
 # %% [markdown]
 # ## What it cannot do
 #
-# - It knows one layer. What the source did not see stays empty; `blend` fills it from several
-#   sources and `choose` finds the few that show most, and what none saw is not made up.
+# - It draws a single layer. What the source did not see stays empty; `blend` fills it from
+#   several sources and `choose` finds the few that show most, and what none saw stays a hole.
 # - Surfaces have no thickness that one image could tell: a column has no end, so that a rod
 #   in front takes away all that a ray passes on its way behind it, though the source may have
 #   seen it. The false holes above are this, and grow with the turn.

@@ -42,7 +42,7 @@ set_matplotlib_formats("jpeg", pil_kwargs={"quality": 80})
 plt.rcParams |= {"figure.dpi": 80, "font.size": 9, "axes.grid": True, "grid.alpha": 0.3}
 
 
-def pictures(titled, columns, width=10.0, **options):
+def show_titled(titled, columns, width=10.0, **options):
     rows = -(-len(titled) // columns)
     size = (width, width / columns * rows * 1.08)
     _, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
@@ -78,7 +78,7 @@ edges, dilated = (
     for d in (1, SIZE // 2 + 1)
 )
 exact = shadow.candidates(*data, size=SIZE, **bias)
-pictures(
+show_titled(
     {
         "one comparison": shaded(hard),
         "depths filtered, then compared:\nthe wrong order": shaded(
@@ -104,10 +104,12 @@ pictures(
 # %%
 masked = shadow.edge_pcf(*data, size=SIZE, **bias)
 print(f"bits that differ: {int(jnp.sum(masked != full))}")
-for name, found, tests in (("depth", exact.where, 2), ("screen", dilated, 1)):
-    count = tests * found.size + int(found.sum()) * SIZE**2
-    share = count / (found.size * SIZE**2)
-    print(f"{name:7} filters {float(found.mean()):5.1%}, {count:,} comparisons: {share:.0%}")
+for name, mask, tests in (("depth", exact.where, 2), ("screen", dilated, 1)):
+    comparisons = tests * mask.size + int(mask.sum()) * SIZE**2
+    share = comparisons / (mask.size * SIZE**2)
+    print(
+        f"{name:7} filters {float(mask.mean()):5.1%}, {comparisons:,} comparisons: {share:.0%}"
+    )
 assert int(exact.comparisons) == 2 * exact.where.size + int(exact.where.sum()) * SIZE**2
 
 # %% [markdown]
@@ -123,9 +125,9 @@ with open(root / "docs/shadow_growth.csv") as file:
     for row in csv.DictReader(file):
         times.setdefault(row["method"], {})[int(row["size"])] = float(row["milliseconds"])
 figure, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
-for method, each in times.items():
+for method, by_size in times.items():
     style = ".--" if method == "native pcf" else ".-"
-    ax.loglog(each.keys(), each.values(), style, label=method)
+    ax.loglog(by_size.keys(), by_size.values(), style, label=method)
 ax.set(xlabel="size of the filter, texels", ylabel="milliseconds")
 ax.minorticks_off()
 ax.set_xticks(list(times["pcf"]), labels=list(times["pcf"]))
@@ -166,19 +168,25 @@ lights = {
 filters = {"hard": 1, "pcf 3 x 3": 3, "pcf 7 x 7": 7}
 constants = np.geomspace(1e-3, 1, 13)
 figure, axes = plt.subplots(2, 2, figsize=(9.5, 6), layout="constrained", sharey=True)
-for (left, right), (light, ((seen, facing_it), its)) in zip(axes, lights.items(), strict=True):
+for (left, right), (light, ((seen, facing_it), by_side)) in zip(
+    axes, lights.items(), strict=True
+):
 
     def error(visible, seen=seen, facing_it=facing_it):
         return float(np.abs(np.asarray(visible) - seen)[facing_it].mean())
 
     for name, size in filters.items():
         half = size / 2
-        errors = [error(shadow.pcf(*each, size=size, slope_bias=half)) for each in its.values()]
+        errors = [
+            error(shadow.pcf(*case, size=size, slope_bias=half)) for case in by_side.values()
+        ]
         left.loglog(sides, errors, ".-", label=name)
-        errors = [error(shadow.pcf(*its[512], size=size, bias=each)) for each in constants]
+        errors = [error(shadow.pcf(*by_side[512], size=size, bias=b)) for b in constants]
         right.loglog(constants, errors, ".-")
         right.axhline(
-            error(shadow.pcf(*its[512], size=size, slope_bias=half)), color="0.6", linestyle=":"
+            error(shadow.pcf(*by_side[512], size=size, slope_bias=half)),
+            color="0.6",
+            linestyle=":",
         )
     left.set(xlabel="side of a map, texels", ylabel=f"mean error, {light}")
     left.minorticks_off()
@@ -216,7 +224,7 @@ for ax, rates, title in zip(axes, np.moveaxis(grid, -1, 0), ("acne", "leaks"), s
 plt.show()
 
 # %% [markdown]
-# A square lamp, 0.2 units wide: 36 rays a point. The error in its penumbra. PCF blurs
+# A square lamp, 0.2 units wide: 36 rays per point. The error in its penumbra. PCF blurs
 # everywhere alike, and no size is right; `pcss` looks for what blocks and filters as wide as
 # the penumbra is; `variance` costs the same at any size, and leaks.
 
@@ -240,7 +248,7 @@ plt.show()
 # %% [markdown]
 # ## What the screen mask misses
 #
-# A plate four texels wide, at several magnifications (pixels a texel), a 7 x 7 filter: the
+# A plate four texels wide, at several magnifications (pixels per texel), a 7 x 7 filter: the
 # share of the penumbra that is left hard, against the dilation. Edges have to reach half a
 # filter as the image shows it, so that one dilation does not serve two magnifications.
 
@@ -251,8 +259,8 @@ for magnification in (0.25, 0.5, 1, 2, 4, 8):
     case = shadow_scenes.plate(magnification, 4)
     sharp, soft = shadow.hard(*case), shadow.pcf(*case, size=SIZE)
     soft_pixels = np.asarray(soft != sharp)
-    found = (shadow.candidates(*case, size=SIZE, edges="screen", dilation=r) for r in reaches)
-    missed = [np.mean(~np.asarray(each.where)[soft_pixels]) for each in found]
+    masks = (shadow.candidates(*case, size=SIZE, edges="screen", dilation=r) for r in reaches)
+    missed = [np.mean(~np.asarray(mask.where)[soft_pixels]) for mask in masks]
     ax.semilogx(reaches, missed, ".-", label=f"{magnification}")
 ax.set(xlabel="dilation, pixels", ylabel="share missed")
 ax.minorticks_off()
@@ -261,9 +269,9 @@ ax.legend(title="pixels a texel", ncols=2)
 plt.show()
 
 # %% [markdown]
-# Wires of one texel, seen at four texels a pixel. Where no pixel's own texel is a wire there is
-# no edge, and the screen mask loses the shadow, whatever the dilation. The mask by depth does
-# not.
+# Wires of one texel, seen at four texels per pixel. Where the texel that a pixel reads is no
+# wire there is no edge, and the screen mask loses the shadow, whatever the dilation. The mask
+# by depth does not.
 
 # %%
 y, x = np.mgrid[:256, :256]
@@ -272,7 +280,7 @@ wires |= np.abs(np.hypot(x - 170, y - 80) - 40) < 0.5
 far = np.where(wires, 2.0, 5.0)
 u, v = np.meshgrid(*[4 * (np.arange(64) + 0.5)] * 2)
 seen = shadow.Receivers(*map(jnp.asarray, (u + 0.25, v + 0.25, np.full_like(u, 4.0), 0 * u)))
-pictures(
+show_titled(
     {
         "one comparison": shadow.hard(far, seen),
         "pcf 7 x 7": shadow.pcf(far, seen, size=SIZE),
@@ -339,7 +347,7 @@ start = (
     AmbientLight([1.0, 1.0, 1.0]),
     DirectionalLight(boxes.turned(np.radians(15), 0.4), [1.0] * 3),
 )
-found = fit.lights(
+fitted = fit.lights(
     boxes.photograph(),
     boxes.gbuffer,
     boxes.eye,
@@ -349,7 +357,9 @@ found = fit.lights(
     loss="squares",
     progress=False,
 )
-print(f"{boxes.miss(start[1]):.0f} degrees at first, {boxes.miss(found.lights[1]):.2f} at last")
+print(
+    f"{boxes.miss(start[1]):.0f} degrees at first, {boxes.miss(fitted.lights[1]):.2f} at last"
+)
 
 # %% [markdown]
 # ## What it cannot do

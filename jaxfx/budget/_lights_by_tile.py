@@ -57,9 +57,9 @@ def try_tiles(search: Search, brought: Energy) -> None:
     # So this bounds the energy that a tile lacks without its 1, 2, ... weakest lights.
     missing = np.cumsum(np.sqrt(np.take_along_axis(energy, order, axis=1)), axis=1) ** 2
     squares = np.pad(missing, ((0, 0), (1, 0)))
-    fewest = spend(squares, search.max_error - spent, brought.size)
-    # In each tile, lights in order of what they bring: the first `fewest` are left out.
-    uses = (np.argsort(order, axis=1) >= fewest[:, None]).T
+    left_out = spend(squares, search.max_error - spent, brought.size)
+    # In each tile, the `left_out` weakest lights are left out.
+    uses = (np.argsort(order, axis=1) >= left_out[:, None]).T
     share = uses.mean(axis=1)
     everywhere = np.flatnonzero(share > _EVERYWHERE)
     parts = np.where((share > _EVERYWHERE)[:, None], False, uses)
@@ -78,10 +78,11 @@ def try_tiles(search: Search, brought: Energy) -> None:
     pixels = blocks(parts[:, tile_of(search.data[0].depth.shape)], lights)
     reads = tuple(n for n in shadowed if share[n] > 0)
     candidate = Tiled(tuple(everywhere.tolist()), reads, pixels)
-    # If its part of the work is no less than what merged lights take, it is not measured.
+    # The work is estimated, as a ratio of that of all lights everywhere. The candidate is only
+    # measured if that is less than the time of each earlier candidate within the allowed error.
     work = float(np.minimum(share / _EVERYWHERE, 1).mean())
-    merged = [trial.time for trial in search.tried if trial.error <= search.max_error]
-    if work < min(merged, default=1):
+    earlier_times = [trial.time for trial in search.tried if trial.error <= search.max_error]
+    if work < min(earlier_times, default=1):
         search.measure(candidate, "; ".join(texts))
     else:
         search.tried.append(Trial(candidate, "; ".join(texts), (), work))
@@ -98,11 +99,11 @@ def _tiled(gbuffer, camera, everywhere, parts, with_ggx):
     """The image of lights and their shadows everywhere, and of those in blocks of pixels."""
     surface = to_surface(gbuffer, camera, with_ggx)
     image = jnp.zeros_like(surface.position)
-    again = jax.checkpoint(reflected, prevent_cse=False)
+    recomputed = jax.checkpoint(reflected, prevent_cse=False)
 
     def add(image, each):
         light, shadow = each
-        part = again(surface, light)
+        part = recomputed(surface, light)
         return image + (part if shadow is None else part * shadow[..., None]), None
 
     for members in by_kind(*zip(*everywhere, strict=True)) if everywhere else []:
@@ -111,8 +112,8 @@ def _tiled(gbuffer, camera, everywhere, parts, with_ggx):
 
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), surface)
     pixels = image.reshape(-1, 3)
-    for some, *of_each in parts:
-        lights, shadows = stacked(some, surface)
+    for chosen, *of_each in parts:
+        lights, shadows = stacked(chosen, surface)
 
         @jax.checkpoint
         def block(pixels, each, lights=lights, shadows=shadows):

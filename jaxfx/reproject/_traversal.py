@@ -132,8 +132,9 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     reached = reached & (nearest < jnp.inf)
 
     # The next texel: where the ray reaches the value, or beyond the border of the cell.
-    go = Moment(jnp.where(reached, reach_time, leave.time), leave.after & ~reached)
-    x_then, y_then = texel_at(go, r.ox, r.dx, left), texel_at(go, r.oy, r.dy, up)
+    next_moment = Moment(jnp.where(reached, reach_time, leave.time), leave.after & ~reached)
+    x_then = texel_at(next_moment, r.ox, r.dx, left)
+    y_then = texel_at(next_moment, r.oy, r.dy, up)
     x_inside = _clip_to_cell(x_then, x, cell_x, read_level, left)
     y_inside = _clip_to_cell(y_then, y, cell_y, read_level, up)
     crosses_x, crosses_y = ~is_earlier(leave_y, leave_x), ~is_earlier(leave_x, leave_y)
@@ -141,8 +142,8 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     next_y = jnp.where(~reached & crosses_y, border_y - up, y_inside)
     stays = reached & ~is_ahead
     next_x, next_y = jnp.where(stays, x, next_x), jnp.where(stays, y, next_y)
-    in_same_parent = ((next_x ^ x) | (next_y ^ y)) >> (level + _LEVEL_STRIDE) == 0
-    level_beyond = jnp.where(in_same_parent, level, level + 1)
+    in_same_ancestor = ((next_x ^ x) | (next_y ^ y)) >> (level + _LEVEL_STRIDE) == 0
+    level_beyond = jnp.where(in_same_ancestor, level, level + 1)
     next_level = jnp.where(reached, jnp.maximum(level - _LEVEL_STRIDE, 0), level_beyond)
 
     is_hit = reached & (level == 0)

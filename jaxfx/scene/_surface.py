@@ -134,14 +134,17 @@ def _normals(scene: Scene, view: View, hits: Hits) -> Float[np.ndarray, "3 hit"]
     """
     flat = view.turn(hits.normal).astype(np.float32)
     toward = view.turn(_unit(hits.toward)).astype(np.float32)
-    normal = _fronts(scene, hits, flat) * np.where(hits.front, _ONE, -_ONE)
+    normal = _front_normals(scene, hits, flat) * np.where(hits.front, _ONE, -_ONE)
     return _unit(normal - np.maximum(_dot(normal, toward), 0) * toward)
 
 
-def _fronts(
+def _front_normals(
     scene: Scene, hits: Hits, flat: Float[np.ndarray, "3 hit"]
 ) -> Float[np.ndarray, "3 hit"]:
-    """Interpolated unit normals with normal maps applied, on the side of the face normals."""
+    """Interpolated unit normals in world space, with normal maps, on the faces' front side.
+
+    `flat` are the faces' own normals, in world space.
+    """
     normal = _interpolate(scene.normals, hits.face, hits.weights)
     normal *= np.where(_dot(normal, flat) < 0, -_ONE, _ONE)
     return _normal_mapped(scene, hits, _unit(np.where((normal == 0).all(axis=0), flat, normal)))
@@ -152,7 +155,7 @@ def at_hits(
 ) -> tuple[Float[np.ndarray, "hit 3"], Float[np.ndarray, "hit 3"], Float[np.ndarray, " hit"]]:
     """Front-side normals, base colour and metallic at hits whose `normal` is in world space."""
     color, metallic, _ = _materials(scene, hits)
-    return _fronts(scene, hits, hits.normal.astype(np.float32)).T, color, metallic
+    return _front_normals(scene, hits, hits.normal.astype(np.float32)).T, color, metallic
 
 
 def _normal_mapped(

@@ -63,7 +63,7 @@ def rounding(method):
     "blur",
     {"inside": 1e-12, "at the border": 0.01},
     SAMPLINGS,
-    "exact, of the picture whose border is repeated; biased, of what lies beyond it",
+    "exact, of the image whose border is repeated; biased, of what lies beyond it",
 )
 def borders(method):
     """Against the blur of an image that goes on: rms error in the four pixels about the frame,

@@ -5,12 +5,12 @@
 | `_taps` | the term of one tap of scatter, and its derivatives, for any sweep over taps |
 | `_shift` | a loop over taps, each over the whole image: for small images |
 | `_tiles` | the same tile by tile, only as far as each tile's sprites reach |
-| `_spans` | discs painted by running sums along rows: for large radii |
+| `_spans` | small sprites by `_tiles`, all others by the span painter: for large radii |
 | `_rows` | for accelerators: all taps of a row in one kernel |
 | `_chords` | sprites of the shape of an iris, by taps and by running sums, on any device |
 | `_segment_sum` | every tap written out: the oracle |
-| `_paint` | steps of spans scattered block by block, and the adjoint of that |
-| `_slices` | the layers of `layered`, cut into slices of defocus and painted by spans |
+| `_span_painter` | discs painted by running sums along rows, and the adjoint of that |
+| `_slices` | the layers of `layered`, cut into slices that the span painter paints |
 | `_compositing` | slices composited from front to back, and the adjoint of that |
 | `_layer_rows` | for accelerators: slices in groups, all taps of a row in one kernel |
 | `_layer_chords` | slices of sprites of the shape of an iris, on any device |

@@ -17,11 +17,9 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._numerics import clip01
 from jaxfx.dof.iris import Outline, chord
+from jaxfx.dof.kernels._span_painter import filled
+from jaxfx.dof.kernels._taps import UNCOUPLED
 from jaxfx.dof.sprites import Sprites, leak_rejection, reach
-
-
-# From this many epsilons on, the leak rejection no longer depends on the source.
-_UNCOUPLED = 3.0
 
 
 class Shaped(NamedTuple):
@@ -89,7 +87,7 @@ def painted(shaped: Shaped, far: int, near: int) -> Float[Array, "height width v
     of all others depends on the target alone.
     """
     (value, radius, leak, coc, epsilon), side, outline = shaped
-    is_coupled = (leak >= 0) & (coc < _UNCOUPLED * epsilon)
+    is_coupled = (leak >= 0) & (coc < UNCOUPLED * epsilon)
     coupled = jnp.where(is_coupled[..., None], value, 0)
     close = Sprites(coupled, jnp.where(is_coupled, radius, 1), leak, coc, epsilon)
     sums = taps(Shaped(close, side, outline), near)
@@ -101,15 +99,11 @@ def painted(shaped: Shaped, far: int, near: int) -> Float[Array, "height width v
 
 def near_reach(epsilon: float, max_coc: float) -> int:
     """How far the sprites go that `painted` hands to `taps`, in pixels."""
-    return reach(min(max_coc, _UNCOUPLED * epsilon))
+    return reach(min(max_coc, UNCOUPLED * epsilon))
 
 
 def _paint(value, radius, side, layer, outline, far):
-    """The sums of the sprites of each of two layers.
-
-    With A the sum of all steps at the pixels that an end cuts, and B that of the fraction cut
-    times the step, the image is `running_sum(A) - B`.
-    """
+    """The sums of the sprites of each of two layers, by the steps of `_span_painter`."""
     height, width, values = value.shape
     rows, columns = height + 2 * far, width + 2 * far + 2
     y = jnp.arange(height)[:, None] + layer * rows + far
@@ -129,6 +123,5 @@ def _paint(value, radius, side, layer, outline, far):
 
     steps = jnp.zeros((2 * rows * columns, 2 * values), value.dtype)
     steps = jax.lax.scan(jax.checkpoint(add_row), steps, jnp.arange(-far, far + 1))[0]
-    steps = steps.reshape(2, rows, columns, 2 * values)
-    sums = jax.lax.cumsum(steps[..., :values], axis=2) - steps[..., values:]
+    sums = filled(steps.reshape(2, rows, columns, 2 * values), axis=2)
     return sums[:, far:, far + 1 :][:, :height, :width]

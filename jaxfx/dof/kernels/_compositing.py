@@ -64,10 +64,10 @@ def fill(index: Int[Array, ""], arriving: Stack, state: Filling) -> Filling:
     """The accumulator after one more slice."""
     allowed, weight, full = allowance(arriving, state.light)
     fills = full & (state.last == _NEVER)  # Slices behind that one do not find room either.
-    found = allowed[None] * arriving
+    added = allowed[None] * arriving
     return Filling(
-        state.light + found,
-        state.late + weight[None] * found,
+        state.light + added,
+        state.late + weight[None] * added,
         jnp.where(fills, index, state.last),
         jnp.where(fills[None], arriving, state.arrived),
         jnp.where(fills, allowed, state.part),
@@ -129,14 +129,19 @@ def begin_reading(filling: Filling, bar: Float[Array, "twice_value height width"
 def read_slice(
     reading: Reading, index: Int[Array, ""], arriving: Stack, state: tuple[Plane, Plane]
 ) -> tuple[Stack, tuple[Plane, Plane]]:
-    """The cotangent of a slice's sums, from the front; and the carry for the next one."""
+    """The cotangent of a slice's sums, from the front; and the carry for the next one.
+
+    The carry: the share of the lens that is filled, and the derivative of the loss through the
+    fallback weights of all slices behind.
+    """
     filled, ahead = state
     filling, bar, late_bar, weight_last, worth, _ = reading
     before, last = index < filling.last, index == filling.last
     late = sum_planes(late_bar * arriving)
     weight = jnp.where(before, filled + arriving[-1] / 2 + _FIRST, weight_last)
-    seen = bar + weight[None] * late_bar
-    seen = seen.at[-1].add(jnp.where(before, ahead - late / 2, 0) - worth)
-    counted = jnp.where(before, 1, jnp.where(last, filling.part, 0))
-    took = lambda x: jnp.where(before, x, 0)
-    return counted[None] * seen, (filled + took(arriving[-1]), ahead - took(late))
+    added_bar = bar + weight[None] * late_bar
+    added_bar = added_bar.at[-1].add(jnp.where(before, ahead - late / 2, 0) - worth)
+    allowed = jnp.where(before, 1, jnp.where(last, filling.part, 0))
+    if_before = lambda x: jnp.where(before, x, 0)
+    carry = filled + if_before(arriving[-1]), ahead - if_before(late)
+    return allowed[None] * added_bar, carry

@@ -1,6 +1,6 @@
 """The sums of `layered` by sprites of any convex shape, in plain loops that JAX differentiates.
 
-Groups of slices are painted by running sums along rows, then composited slice by slice. The
+Groups of slices are painted by spans (`_span_painter`), then composited slice by slice. The
 loops' bodies are rematerialised: a reverse pass keeps the accumulator of each group and no row.
 One program serves CPUs and accelerators.
 
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from jaxfx.dof.iris import Outline, chord
 from jaxfx.dof.kernels._compositing import allowance
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets, share_of
+from jaxfx.dof.kernels._span_painter import filled
 from jaxfx.dof.sprites import POINT_RADIUS
 
 
@@ -53,18 +54,14 @@ def _add_slice(state, arrived):
     """Put what finds room of a slice into the lens, and the same weighted."""
     light, late = state
     allowed, weight, _ = allowance(arrived, light)
-    found = allowed[None] * arrived
-    return (light + found, late + weight[None] * found), None
+    added = allowed[None] * arrived
+    return (light + added, late + weight[None] * added), None
 
 
 def _arriving(
     extent: Extent, sheet: Sheets, outline: Outline, first: Int[Array, ""]
 ) -> Float[Array, "slice value height width"]:
-    """Sums of the sprites of each slice of a group, per pixel of the frame.
-
-    With A the sum of all steps at the pixels that an end cuts, and B that of the fraction cut
-    times the step, the image is `running_sum(A) - B`.
-    """
+    """Sums of the sprites of each slice of a group, per pixel of the frame."""
     far = extent.reach
     value, radius, (tilt_x, tilt_y), place = sheet
     radius = jnp.where(radius > 0, radius, POINT_RADIUS)
@@ -101,6 +98,5 @@ def _arriving(
 
     steps = jnp.zeros((_GROUP * height * (width + 1), 2 * values), value.dtype)
     steps = jax.lax.scan(jax.checkpoint(add_row), steps, jnp.arange(-far, far + 1))[0]
-    steps = steps.reshape(*cells, 2 * values)
-    sums = jax.lax.cumsum(steps[..., :values], axis=2) - steps[..., values:]
+    sums = filled(steps.reshape(*cells, 2 * values), axis=2)
     return jnp.moveaxis(sums[:, :, :width], -1, 1)

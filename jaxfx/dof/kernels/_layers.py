@@ -52,8 +52,8 @@ def _filled(extent: Extent, sheets: Sheets) -> Filling:
     grid = Grid(extent.reach, sheets)
     discs = grid.discs(sheets)
 
-    def add(index, order, count, state):
-        return fill(index, grid.paint(index, order, count, discs), state)
+    def add(index, is_held, state):
+        return fill(index, grid.paint(index, is_held, discs), state)
 
     return grid.each_slice(discs, add, nothing_filled(extent, sheets))
 
@@ -64,21 +64,22 @@ def _tangent(
     grid = Grid(extent.reach, sheets)
     discs, dots = grid.discs(sheets), grid.discs(sheets, dot)
 
-    def add(index, order, count, state):
+    def add(index, is_held, state):
         light, light_dot, late_dot = state
-        arriving, arriving_dot = jnp.split(grid.paint(index, order, count, discs, dots), 2)
+        arriving, arriving_dot = jnp.split(grid.paint(index, is_held, discs, dots), 2)
         allowed, weight, full = allowance(arriving, light)
-        taken = light_dot[-1] + allowed * arriving_dot[-1]
-        allowed_dot = jnp.where(full, -taken / jnp.where(full, arriving[-1], 1), 0)
-        found = allowed[None] * arriving
-        found_dot = allowed[None] * arriving_dot + allowed_dot[None] * arriving
-        weight_dot = light_dot[-1] + found_dot[-1] / 2
-        late_dot = late_dot + weight[None] * found_dot + weight_dot[None] * found
-        return light + found, light_dot + found_dot, late_dot
+        # Where the lens gets full, the share that is filled stays: its tangent is 0.
+        filled_dot = light_dot[-1] + allowed * arriving_dot[-1]
+        allowed_dot = jnp.where(full, -filled_dot / jnp.where(full, arriving[-1], 1), 0)
+        added = allowed[None] * arriving
+        added_dot = allowed[None] * arriving_dot + allowed_dot[None] * arriving
+        weight_dot = light_dot[-1] + added_dot[-1] / 2
+        late_dot = late_dot + weight[None] * added_dot + weight_dot[None] * added
+        return light + added, light_dot + added_dot, late_dot
 
-    nothing = jnp.zeros((grid.values, grid.height, grid.width), sheets.value.dtype)
-    _, *found = grid.each_slice(discs, add, (nothing, nothing, nothing))
-    return jnp.concatenate(found)
+    nothing = jnp.zeros(grid.shape, sheets.value.dtype)
+    _, *tangents = grid.each_slice(discs, add, (nothing, nothing, nothing))
+    return jnp.concatenate(tangents)
 
 
 def _adjoint(
@@ -88,11 +89,11 @@ def _adjoint(
     reading = begin_reading(_filled(extent, sheets), bar)
     discs = grid.discs(sheets)
 
-    def read(index, order, count, state):
+    def read(index, is_held, state):
         bars, *carry = state
-        arriving = grid.paint(index, order, count, discs)
-        seen, carry = read_slice(reading, index, arriving, tuple(carry))
-        return grid.read_back(index, order, count, discs, seen, bars), *carry
+        arriving = grid.paint(index, is_held, discs)
+        arriving_bar, carry = read_slice(reading, index, arriving, tuple(carry))
+        return grid.read_back(index, is_held, discs, arriving_bar, bars), *carry
 
     return grid.planes(grid.each_slice(discs, read, (jnp.zeros_like(discs), *reading.start))[0])
 
@@ -136,8 +137,8 @@ def plain(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height wi
         some = (share_of(place - index.astype(place.dtype)) > 0).any()
         arrived = cond(some, arriving, lambda _: jnp.zeros_like(light), index)
         allowed, weight, _ = allowance(arrived, light)
-        found = allowed[None] * arrived
-        return (light + found, late + weight[None] * found), None
+        added = allowed[None] * arrived
+        return (light + added, late + weight[None] * added), None
 
     nothing = jnp.zeros((value.shape[1], height, width), value.dtype)
     slices = jnp.arange(-SLICES, SLICES + 1 + (len(value) - 1) * APART)

@@ -20,15 +20,14 @@ from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels import _tiles
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
-from jaxfx.dof.kernels._paint import paint, read_back
-from jaxfx.dof.kernels._taps import Planes, inside, to_planes
+from jaxfx.dof.kernels._span_painter import Blocks, Discs, read, too_bright, write
+from jaxfx.dof.kernels._taps import UNCOUPLED, Planes, inside, to_planes
 from jaxfx.dof.sprites import POINT_RADIUS, Sprites
 
 
-# From this many epsilons on, the leak rejection no longer depends on the source.
-_UNCOUPLED = 3.0
-# A value this many times what a pixel usually sums to would leave 1e-6 of that along its row.
-_HIGHLIGHT = 16.0
+# Height and width of a block in pixels: enough discs to spread the overhead of a row; their
+# steps fill a megabyte at a radius of 64. Larger blocks do not fit into a core's cache.
+BLOCK = (32, 128)
 
 
 def spans(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
@@ -41,7 +40,7 @@ def _parts(
 ) -> tuple[Bool[Array, "height width"], Planes, list[Float[Array, "height width"]]]:
     """Which sprites go by tiles; those; the radii of the others before and behind the focus."""
     value, radius, leak, coc = planes
-    direct = (coc < _UNCOUPLED) | _too_bright(value, radius)
+    direct = (coc < UNCOUPLED) | too_bright(value, radius)
     near = Planes(
         jnp.where(direct[None], value, 0), jnp.where(direct, radius, POINT_RADIUS), leak, coc
     )
@@ -49,16 +48,71 @@ def _parts(
     return direct, near, layers
 
 
-def _too_bright(
-    value: Float[Array, "value height width"], radius: Float[Array, "height width"]
-) -> Bool[Array, "height width"]:
-    """Where a value is far above what a pixel sums to, the brightest pixels left aside."""
-    size = jnp.abs(value).max(axis=0)
-    total = jnp.pi * radius * radius * size
-    usual = jnp.mean(total)
-    for _ in range(3):
-        usual = jnp.mean(jnp.minimum(total, usual))
-    return size > _HIGHLIGHT * usual
+def paint(
+    reach: int,
+    value: Float[Array, "value height width"],
+    radius: Float[Array, "height width"],
+    dot: tuple[Float[Array, "value height width"], Float[Array, "height width"]] | None = None,
+) -> Float[Array, "value height width"]:
+    """The sum of all discs, each its value times its coverage; a radius of 0 is no disc.
+
+    Given `dot`, tangents of value and radius, the derivative of that along them.
+    """
+    blocks = _blocks(reach, radius)
+    planes = [*map(blocks.whole, (value, radius[None]))]
+    dots = None if dot is None else [*map(blocks.whole, (dot[0], dot[1][None]))]
+
+    def write_block(block, steps):
+        discs = _cut(blocks, planes, block)
+        there = discs.radius[:, None] > 0
+        # What is no disc must write nothing: two steps that cancel would leave their rounding.
+        discs = discs._replace(value=jnp.where(there, discs.value, 0))
+        places = blocks.places(radius.dtype)
+        if dots is None:
+            return write(blocks, places, discs, steps)
+        moved = _cut(blocks, dots, block)
+        moved = moved._replace(value=jnp.where(there, moved.value, 0))
+        return write(blocks, places, discs, steps, moved, tangent_only=True)
+
+    return blocks.paint(blocks.are_held(radius), write_block, (1, len(value)), value.dtype)
+
+
+def read_back(
+    reach: int,
+    value: Float[Array, "value height width"],
+    radius: Float[Array, "height width"],
+    bar: Float[Array, "value height width"],
+    bars: tuple[Float[Array, "value height width"], Float[Array, "height width"]],
+    weight: Float[Array, "height width"] | None = None,
+) -> tuple[Float[Array, "value height width"], Float[Array, "height width"]]:
+    """The adjoint of `paint`, times `weight`, at `bar`, added to `bars`.
+
+    These are the cotangents of value and radius.
+    """
+    blocks = _blocks(reach, radius)
+    planes = [*map(blocks.whole, (value, radius[None]))]
+
+    def read_block(block, steps, bars):
+        discs = _cut(blocks, planes, block)
+        found = read(blocks, blocks.places(radius.dtype), discs, steps)
+        found = found.value, found.radius[:, None]
+        return [blocks.added(x, block, y) for x, y in zip(bars, found, strict=True)]
+
+    found = [*map(blocks.whole, (bars[0], bars[1][None]))]
+    found = blocks.read_back(blocks.are_held(radius), read_block, bar, found, weight)
+    height, width = radius.shape
+    value_bar, radius_bar = (x[:, :height, :width] for x in found)
+    return value_bar, radius_bar[0]
+
+
+def _blocks(reach: int, radius: Float[Array, "height width"]) -> Blocks:
+    # One more column on either side of a window, as rounding may carry an end that far.
+    return Blocks(radius.shape, BLOCK, (reach, reach + 1))
+
+
+def _cut(blocks: Blocks, planes: list[Array], block: Array) -> Discs:
+    value, radius = (blocks.cut(x, block) for x in planes)
+    return Discs(value, radius[:, 0])
 
 
 def _forward(reach: int, planes: Planes) -> Float[Array, "value height width"]:

@@ -11,6 +11,12 @@ from jaxfx._numerics import clip01
 from jaxfx.dof.sprites import Sprites
 
 
+# Circle of confusion of a background source, in epsilons, from which on the leak rejection does
+# not depend on it: a target that rejects has less than 2, so that the clamp of the difference
+# is 1. Follows from `leak_rejection`: a smaller number is wrong, a larger one only slower.
+UNCOUPLED = 3.0
+
+
 class Sweep(NamedTuple):
     """A program that visits all taps.
 

@@ -12,16 +12,16 @@ import optimistix as optx
 import pytest
 
 from jaxfx import ThinLens, dof
-from jaxfx.dof.kernels._paint import BLOCK
 from jaxfx.dof.kernels._shift import shift
-from jaxfx.dof.kernels._spans import spans
+from jaxfx.dof.kernels._spans import BLOCK, spans
 from jaxfx.dof.kernels._tiles import tiles
 from jaxfx.dof.sprites import Sprites
 from tests.helpers.forms import first
 
 
 REACH = 21
-SHAPE = (BLOCK[0] + 7, BLOCK[1] + 9)
+# Two blocks down and two across: one and a half would be one.
+SHAPE = (BLOCK[0] * 3 // 2 + 3, BLOCK[1] * 3 // 2 + 5)
 PROGRAMS = {"shift": shift, "tiles": tiles, "spans": spans}
 
 

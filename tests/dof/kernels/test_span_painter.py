@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.dof.kernels._paint import BLOCK, paint, read_back
+from jaxfx.dof.kernels._spans import BLOCK, paint, read_back
 from jaxfx.dof.sprites import coverage, row_half_width
 
 
 REACH = 5
-SHAPE = (BLOCK[0] + 3, BLOCK[1] + 2)
+# Two blocks down and two across: one and a half would be one.
+SHAPE = (BLOCK[0] * 3 // 2 + 1, BLOCK[1] * 3 // 2 + 3)
 
 
 def discs(seed):
@@ -21,7 +22,11 @@ def discs(seed):
 
 
 def test_one_disc_is_its_coverage():
-    for row, column in ((0, 0), (BLOCK[0], BLOCK[1] - 1), (SHAPE[0] - 1, SHAPE[1] - 1)):
+    for row, column in (
+        (0, 0),
+        (SHAPE[0] // 2, SHAPE[1] // 2 - 1),
+        (SHAPE[0] - 1, SHAPE[1] - 1),
+    ):
         value = jnp.zeros((1, *SHAPE)).at[0, row, column].set(2.0)
         radius = jnp.zeros(SHAPE).at[row, column].set(3.7)
         painted = np.asarray(paint(REACH, value, radius))[0]
