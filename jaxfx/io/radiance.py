@@ -29,11 +29,11 @@ def decode_radiance(path: StrPath, data: bytes) -> np.ndarray:
             f"+X width`, got the size {size[:40]!r}."
         )
     height, width = map(int, shape.groups())
+    exposures = re.findall(rb"^EXPOSURE= *(\S+)", header, re.MULTILINE)
     try:
         texels = _texels(body, height, width)
-        exposures = re.findall(rb"^EXPOSURE= *(\S+)", header, re.MULTILINE)
         exposure = float(np.prod([float(number) for number in exposures]))
-    except (IndexError, ValueError) as error:
+    except (EOFError, IndexError, ValueError) as error:
         raise ValueError(f"`{path}` is damaged: {error}") from error
     if height * width == 0 or not 0 < exposure < np.inf:
         raise ValueError(
@@ -51,18 +51,18 @@ def _texels(body: bytes, height: int, width: int) -> np.ndarray:
     if width not in _CODED_WIDTHS or not body.startswith(marker):
         flat = np.frombuffer(body, np.uint8)
         if flat.size != 4 * height * width:
-            raise ValueError(f"{flat.size} bytes for {height} x {width} pixels of 4 bytes")
+            raise EOFError(f"{flat.size} bytes for {height} x {width} pixels of 4 bytes")
         texels = flat.reshape(height, width, 4)
         # Pixels of 1, 1, 1 repeat the one before them, in files of the first version.
         if (texels[..., :3] == 1).all(axis=-1).any():
-            raise ValueError("pixels are coded as in the first version, which is not read")
+            raise EOFError("pixels are coded as in the first version, which is not read")
         return texels
     if len(body) < 4 * height:
-        raise ValueError(f"{len(body)} bytes for {height} rows")
+        raise EOFError(f"{len(body)} bytes for {height} rows")
     channels, at = np.empty((height, 4, width), np.uint8), 0
     for row in channels:
         if body[at : at + 4] != marker:
-            raise ValueError("a row does not begin with its width")
+            raise EOFError("a row does not begin with its width")
         at += 4
         for channel in row:
             at = _fill_channel(channel, body, at)
@@ -78,7 +78,7 @@ def _fill_channel(channel: np.ndarray, body: bytes, at: int) -> int:
         count -= 128 * is_run
         stored = body[at : at + (1 if is_run else count)]
         if not 0 < count <= len(channel) - done or not stored:
-            raise ValueError("a row ends early or is too long")
+            raise EOFError("a row ends early or is too long")
         channel[done : done + count] = np.frombuffer(stored, np.uint8)
         done, at = done + count, at + len(stored)
     return at
