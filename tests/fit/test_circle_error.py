@@ -16,7 +16,7 @@ def test_the_variances_are_those_of_solving_again_with_each_error():
     widening = rng.normal(size=(2, 12, 3))
     circle = np.maximum(abs(defocus), 1).reshape(2, 12, 1)
     expected = np.zeros(4)
-    for error in (0.03 * widening, 0.25 * widening / circle):
+    for error in (0.05 * widening, 0.33 * widening / circle):
         for photograph in range(2):
             for stratum in np.argsort(defocus[photograph], axis=None).reshape(6, 2):
                 wrong = np.zeros_like(error)
@@ -43,7 +43,7 @@ def test_equal_defocus_shares_a_stratum_and_missing_depth_spoils_none():
 @pytest.mark.full
 def test_intervals_hold_the_true_lens_of_a_photograph_by_many_passes():
     """Rooms on which nothing was chosen; `python -m benchmarks.fit_coverage` fits 120."""
-    errors, stated, doubts = zip(*map(fit_coverage.fitted, range(200, 224)), strict=True)
+    errors, stated, doubts = zip(*map(fit_coverage.fitted, range(300, 324)), strict=True)
     is_told = [not doubt for doubt in doubts]
     held = np.abs(errors) < 1.96 * np.array(stated)
     assert np.sum(is_told) >= 20
