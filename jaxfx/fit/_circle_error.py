@@ -44,7 +44,7 @@ def variances(
     scaled = columns / norms[None]
     errors = jnp.concatenate(
         [
-            jax.ops.segment_sum(scaled * error[:, None], block, defocus.shape[0] * _STRATA)
+            jax.ops.segment_sum(scaled * error[:, None], block, _STRATA)
             for error in (_RATIO * widening, absolute)
         ]
     )
@@ -61,7 +61,8 @@ def strata(
     """The stratum of each pixel: sixths of a photograph's pixels, by their defocus.
 
     Equal values share a stratum. What lies before and what lies behind the focus have errors of
-    their own: only their difference moves a focus distance.
+    their own: only their difference moves a focus distance. All photographs show one scene, so
+    that a stratum has the same surfaces in each, and the same error.
     """
     defocus = jnp.nan_to_num(defocus)
 
@@ -69,6 +70,4 @@ def strata(
         shares = jnp.arange(1, _STRATA, dtype=own.dtype) / _STRATA
         return jnp.searchsorted(jnp.quantile(own, shares), own.reshape(-1), side="right")
 
-    rank = jax.vmap(ranked)(defocus).reshape(defocus.shape)
-    first = _STRATA * jnp.arange(defocus.shape[0], dtype=rank.dtype)
-    return first[:, None, None] + rank
+    return jax.vmap(ranked)(defocus).reshape(defocus.shape)

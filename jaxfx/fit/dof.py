@@ -55,9 +55,11 @@ class DofFit(eqx.Module):
       their units, and the `"loss"` of each.
     - `standard_errors`: by the name of each fitted parameter, in its unit; one for each
       photograph where it differs between them. From a jackknife: the residuals of 8 x 8 tiles
-      of the image are taken for independent of one another, and no others. Of lenses, `scale`
-      and `shift`, the variance by strata of like circles of confusion is added, in which an
-      effect errs alike. A parameter that the images do not determine has a large one, or inf.
+      of the image are taken for independent of one another, and no others. With
+      `loss="robust"` those of lenses, `scale`, `shift` and the iris allow for what an effect
+      draws wrong: circles of confusion that are off by 5 % and a third of a pixel, alike for
+      all pixels of about the same defocus. A parameter that the images do not determine has a
+      large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
       pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
@@ -175,14 +177,16 @@ def dof(
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
-    - `behind`: the second layer, as in `dof.layered`; None fits through a single one.
+    - `behind`: the second layer, as in `dof.layered`; None fits through a single one. It is
+      not guessed: to draw what was fitted, give `dof.layered` the same `behind`, None too.
     - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
       may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
-    - `loss`: `"robust"`, or `"squares"`: all pixels alike, and the footprint is held at 0.
+    - `loss`: `"robust"`, or `"squares"` for images that the effect itself made: all pixels
+      alike, the footprint is held at 0, and the standard errors are those of noise alone.
     - `tone`: `"linear"`, or `"log"` for what is far above the reference's mean.
     - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default

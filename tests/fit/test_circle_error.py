@@ -17,14 +17,12 @@ def test_the_variances_are_those_of_solving_again_with_each_error():
     circle = np.maximum(abs(defocus), 1).reshape(2, 12, 1)
     expected = np.zeros(4)
     for error in (0.05 * widening, 0.33 * widening / circle):
-        for photograph in range(2):
-            for stratum in np.argsort(defocus[photograph], axis=None).reshape(6, 2):
-                wrong = np.zeros_like(error)
-                wrong[photograph, stratum] = error[photograph, stratum]
-                moves = np.linalg.lstsq(columns.reshape(-1, 4), wrong.reshape(-1), rcond=None)[
-                    0
-                ]
-                expected += moves**2
+        for stratum in np.argsort(defocus.reshape(2, 12)).reshape(2, 6, 2).swapaxes(0, 1):
+            wrong = np.zeros_like(error)
+            for photograph, pixels in enumerate(stratum):
+                wrong[photograph, pixels] = error[photograph, pixels]
+            aim = columns.reshape(-1, 4), wrong.reshape(-1)
+            expected += np.linalg.lstsq(*aim, rcond=None)[0] ** 2
     given = columns.reshape(-1, 4), widening.reshape(-1), defocus
     found = _circle_error.variances(*map(jnp.asarray, given))
     np.testing.assert_allclose(found, expected, rtol=1e-8)
