@@ -15,8 +15,8 @@
 #
 # Every effect here is a differentiable function of its parameters, so an image can be asked
 # for them: least squares between the effect's output and the image. `fit.dof` asks for a
-# lens, `fit.camera` for a pose, `fit.lights` for the lights. How well they do:
-# [docs/fits.md](../docs/fits.md).
+# lens, `fit.camera` for a pose, `fit.lights` for the lights;
+# `docs/fits.md` says how well.
 
 # %%
 import tempfile
