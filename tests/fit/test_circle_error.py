@@ -39,6 +39,7 @@ def test_equal_defocus_shares_a_stratum_and_missing_depth_spoils_none():
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("optimised")
 def test_intervals_hold_the_true_lens_of_a_photograph_by_many_passes():
     """Rooms on which nothing was chosen; `python -m benchmarks.fit_coverage` fits 120."""
     errors, stated, doubts = zip(*map(fit_coverage.fitted, range(300, 316)), strict=True)
