@@ -15,15 +15,19 @@
 #
 # Every effect here is a differentiable function of its parameters, so an image can be asked
 # for them: least squares between the effect's output and the image. `fit.dof` asks for a
-# lens, as `examples/fit_lens.py` shows; `fit.lights`, here, for the lights.
+# lens, `fit.camera` for a pose, `fit.lights` for the lights;
+# `docs/fits.md` says how well.
 
 # %%
+import tempfile
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
+from PIL import Image
 
 from jaxfx import (
     AmbientLight,
@@ -33,6 +37,10 @@ from jaxfx import (
     PinholeCamera,
     PointLight,
     SpotLight,
+    ThinLens,
+    depth as depths,
+    dof,
+    exr,
     fit,
     io,
     relight,
@@ -55,6 +63,77 @@ def show(**images):
         axis.set(title=name.replace("_", " "), xticks=[], yticks=[])
     plt.show()
 
+
+# %% [markdown]
+# ## A lens, from two EXR files
+#
+# A render as Blender writes it, image and depth in one file, and the same view through a lens.
+# Both are made here, the second by 64 passes.
+
+# %%
+folder = Path(tempfile.mkdtemp())
+lamps = scene.default_lights(camera)
+
+
+def taken(eye):
+    seen = scene.gbuffer(room, eye, **SIZE)
+    return relight.render(seen, eye, lamps), seen.depth
+
+
+image, depth = taken(camera)
+exr.write(folder / "render.exr", {"ViewLayer.Combined": image, "ViewLayer.Depth": depth})
+lens = ThinLens.from_camera(camera, aperture=0.1, focus_distance=2.5)
+passes = dof.accumulate(lambda eye: taken(eye)[0], camera, lens, samples=64, progress=False)
+exr.write(folder / "lens.exr", passes.image)
+
+# %% [markdown]
+# The search starts with an aperture that is 30 % too large and a focus that is 15 % too far.
+
+# %%
+image, depth = exr.read_rgbd(folder / "render.exr")
+photograph = io.read_color(folder / "lens.exr")
+start = ThinLens(1.3 * lens.aperture, 1.15 * lens.focus_distance, lens.focal_pixels)
+names = "aperture", "focus_distance"
+options = {"effect": "layered", "parameters": names, "max_coc": 12, "throw": False}
+fitted = fit.dof(photograph, image, depth, start, **options)
+for name in names:
+    value, true = (float(getattr(each, name)) for each in (fitted.lens, lens))
+    print(f"{name:15}{value:.4f} +- {fitted.standard_errors[name]:.4f}, true {true:.4f}")
+print(fitted.success, fitted.doubt)
+show(render=image, through_a_lens=photograph, fitted=fitted.image)
+
+# %% [markdown]
+# ## A pose, from two RGB-D frames
+#
+# As a depth camera writes them: colour as sRGB of 8 bits, depth in millimetres of 16 bits, 0
+# where there is none. The second frame is taken from 9 cm and 2.9 degrees aside.
+
+# %%
+aside = np.eye(4)
+aside[:3, :3] = [[np.cos(0.05), 0, np.sin(0.05)], [0, 1, 0], [-np.sin(0.05), 0, np.cos(0.05)]]
+aside[:3, 3] = 0.08, 0.02, 0.03
+second = PinholeCamera(camera.intrinsics, camera.world_from_camera @ aside)
+for name, eye in (("first", camera), ("second", second)):
+    colors, depth = taken(eye)
+    io.write_png(folder / f"{name}.png", colors)
+    millimetres = np.where(np.isfinite(depth), np.rint(1000 * depth), 0).astype(np.uint16)
+    Image.fromarray(millimetres).save(folder / f"{name}_depth.png")
+
+
+def frame(name):
+    millimetres = io.read_depth(folder / f"{name}_depth.png")
+    return io.read_color(folder / f"{name}.png"), depths.clean(millimetres, unit=1e-3)
+
+
+(image, depth), (other, other_depth) = frame("first"), frame("second")
+start = PinholeCamera(second.intrinsics, camera.world_from_camera)
+found = fit.camera(other, image, depth, camera, start, reference_depth=other_depth, throw=False)
+motion = np.linalg.inv(second.world_from_camera) @ found.camera.world_from_camera - np.eye(4)
+turn = np.linalg.norm(motion[:3, :3]) / np.sqrt(2)
+shift, angle = (float(jnp.linalg.norm(each)) for each in found.standard_errors.values())
+print(f"off by {1000 * np.linalg.norm(motion[:3, 3]):.1f} mm, {np.degrees(turn):.3f} degrees")
+print(f"stated {1000 * shift:.1f} mm, {np.degrees(angle):.3f} degrees")
+print(found.success, found.doubt)
 
 # %% [markdown]
 # ## Three lights

@@ -1,4 +1,4 @@
-"""The noise that `fit.dof` estimates for each pixel, and groups of pixels that err alike.
+"""The noise that `fit.dof` estimates for each pixel.
 
 A photograph with a wide aperture shows surfaces that are hidden in the image from which the
 effect is drawn. Near an edge in depth, the drawn image is therefore wrong by more than noise.
@@ -12,7 +12,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxfx.dof.spoiled import spoiled
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Model, Values
@@ -39,11 +39,6 @@ _OUTLIER = 20.0
 # By how much an unknown (a logarithm) is moved to see which pixels depend on it. A smaller one
 # measures rounding in float32, a larger one is no longer linear.
 _NUDGE = 0.03
-
-# Number of groups ("strata") by circle of confusion into which the pixels near edges are
-# divided, and as many for those far from edges. Each is one block of the jackknife. With fewer,
-# its variance is estimated poorly; with more, pixels with a common error count as independent.
-STRATA = 6
 
 
 def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
@@ -82,7 +77,7 @@ def _noise(model, values, difference, sensitivity, has_edges):
         everywhere = deviation(sensitivity)
         return without_outliers(jnp.full(size.shape, everywhere)), everywhere
     reached = functools.partial(_near_edges, max_coc=model.max_coc)
-    is_near = jax.vmap(reached)(_defocus(model, values), model.circles(values))
+    is_near = jax.vmap(reached)(defocus(model, values), model.circles(values))
     near = is_near[..., None]
     away = deviation(jnp.where(near, 0, sensitivity))
     beside = deviation(jnp.where(near, sensitivity, 0))
@@ -92,12 +87,12 @@ def _noise(model, values, difference, sensitivity, has_edges):
     return without_outliers(scale), away
 
 
-def _defocus(model: Model, values: Values) -> Float[Array, "photograph height width"]:
+def defocus(model: Model, values: Values) -> Float[Array, "photograph height width"]:
     """The defocus in pixels, NaN where the depth is missing."""
     depth, _ = model.depths(values)
     count = model.images.focal_pixels.size
-    defocus = [model.lens(values, photograph).defocus(depth) for photograph in range(count)]
-    return jnp.where(depth > 0, jnp.stack(defocus), jnp.nan)
+    signed = [model.lens(values, photograph).defocus(depth) for photograph in range(count)]
+    return jnp.where(depth > 0, jnp.stack(signed), jnp.nan)
 
 
 def _near_edges(defocus: Array, circles: Array, max_coc: int | float) -> Array:
@@ -120,27 +115,3 @@ def _deviation(size: Array, weight: Array, least: Array) -> Array:
     total = jnp.cumsum(weight.reshape(-1)[order])
     at = jnp.searchsorted(total, _WITHIN * total[-1])
     return jnp.maximum(size.reshape(-1)[order][jnp.minimum(at, size.size - 1)], least)
-
-
-@functools.partial(jax.jit, static_argnames=("channels", "bins"))
-def strata(
-    circles: Float[Array, "photograph height width"],
-    scale: Float[Array, "photograph height width"],
-    channels: int,
-    bins: int = STRATA,
-) -> Int[Array, " residual"]:
-    """The stratum of each residual, 0 to `2 * bins - 1`.
-
-    The first `bins` are for pixels of the least noise, the others for all other pixels, those
-    left out included. Either half is sorted by circle of confusion and divided equally. The
-    error of a drawn image depends on the circle of confusion and on edges, so that all pixels
-    of a stratum may have the same error.
-    """
-    is_noisy = (scale > jnp.min(scale)).reshape(-1)
-    circles = circles.reshape(-1)
-    place = jnp.argsort(jnp.argsort(circles + jnp.where(is_noisy, 2 * jnp.max(circles), 0)))
-    quiet = jnp.sum(~is_noisy)
-    rank = jnp.where(is_noisy, place - quiet, place)
-    size = jnp.maximum(jnp.where(is_noisy, is_noisy.size - quiet, quiet), 1)
-    stratum = jnp.minimum(rank * bins // size, bins - 1) + jnp.where(is_noisy, bins, 0)
-    return jnp.repeat(stratum, channels)

@@ -1,7 +1,7 @@
 """The residual of `fit.dof`: what the model draws, less the photographs, after exposure."""
 
 import functools
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -94,15 +94,36 @@ def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " photograph
     return jnp.mean(jnp.abs(difference) * weights, axis=(1, 2, 3))
 
 
+class Report(NamedTuple):
+    """A residual and its derivatives at some unknowns.
+
+    - `columns`: the Jacobian in the order of `ravel_pytree`.
+    - `widening`: the derivative in the logarithm of a factor on all circles of confusion.
+    - `drawn`, `gain`, `offset`: as `Residual.compare` gives them.
+    """
+
+    columns: Float[Array, "residual unknown"]
+    widening: Float[Array, " residual"]
+    residual: Float[Array, "photograph height width channel"]
+    drawn: Float[Array, "photograph height width channel"]
+    gain: Float[Array, "photograph channel"]
+    offset: Float[Array, "photograph channel"]
+
+
 @eqx.filter_jit
-def report(residual: Residual, unknowns: Values) -> tuple[Array, Array, Array, Array, Array]:
-    """The Jacobian in the order of `ravel_pytree`, the residual, and the rest of `compare`."""
+def report(residual: Residual, unknowns: Values) -> Report:
+    """The residual, its derivatives, and the rest of `compare`."""
     flat, tree = ravel_pytree(unknowns)
+    aperture = residual.model.start["aperture"]
 
     def both(flat):
-        difference, *rest = residual.compare(tree(flat))
+        wide = aperture * jnp.exp(flat[-1]).astype(aperture.dtype)
+        widened = eqx.tree_at(lambda r: r.model.start["aperture"], residual, wide)
+        difference, *rest = widened.compare(tree(flat[:-1]))
         weighted = residual.weighted(difference)
         return weighted, (weighted, *rest)
 
-    columns, (weighted, *rest) = jax.jacfwd(both, has_aux=True)(flat)
-    return columns.reshape(-1, flat.size), weighted, *rest
+    extended = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
+    columns, (weighted, *rest) = jax.jacfwd(both, has_aux=True)(extended)
+    columns = columns.reshape(-1, extended.size)
+    return Report(columns[:, :-1], columns[:, -1], weighted, *rest)

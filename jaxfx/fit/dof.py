@@ -17,12 +17,12 @@ from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, number, whole_number
 from jaxfx._progress import Bar
 from jaxfx.dof.iris import Iris, check_iris
-from jaxfx.fit import _lens_arguments as read
+from jaxfx.fit import _circle_error, _lens_arguments as read
 from jaxfx.fit._descent import End, Solver, check_success, descend
 from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Model, Values
-from jaxfx.fit._lens_noise import STRATA, strata
-from jaxfx.fit._lens_residual import Residual, Tone, evaluate, plain, report
+from jaxfx.fit._lens_noise import defocus
+from jaxfx.fit._lens_residual import Report, Residual, Tone, evaluate, plain, report
 from jaxfx.fit._lens_search import Search
 from jaxfx.lens import ThinLens
 
@@ -55,9 +55,11 @@ class DofFit(eqx.Module):
       their units, and the `"loss"` of each.
     - `standard_errors`: by the name of each fitted parameter, in its unit; one for each
       photograph where it differs between them. From a jackknife: the residuals of 8 x 8 tiles
-      of the image are taken for independent of one another, and no others. Of lenses, `scale`
-      and `shift`, the variance by strata of like circles of confusion is added, in which an
-      effect errs alike. A parameter that the images do not determine has a large one, or inf.
+      of the image are taken for independent of one another, and no others. With
+      `loss="robust"` those of lenses, `scale`, `shift` and the iris allow for what an effect
+      draws wrong: circles of confusion that are off by 5 % and a third of a pixel, alike for
+      all pixels of about the same defocus. A parameter that the images do not determine has a
+      large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
       pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
@@ -175,14 +177,16 @@ def dof(
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
-    - `behind`: the second layer, as in `dof.layered`; None fits through a single one.
+    - `behind`: the second layer, as in `dof.layered`; None fits through a single one. It is
+      not guessed: to draw what was fitted, give `dof.layered` the same `behind`, None too.
     - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
       may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
-    - `loss`: `"robust"`, or `"squares"`: all pixels alike, and the footprint is held at 0.
+    - `loss`: `"robust"`, or `"squares"` for images that the effect itself made: all pixels
+      alike, the footprint is held at 0, and the standard errors are those of noise alone.
     - `tone`: `"linear"`, or `"log"` for what is far above the reference's mean.
     - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
@@ -262,8 +266,8 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     """The result at the end of a search: parameters, images and standard errors."""
     model = residual.model
     values = model.values(end.unknowns)
-    columns, rest, drawn, gain, offset = report(residual, end.unknowns)
-    variances = _variances(residual, end.unknowns, columns, rest)
+    reported = report(residual, end.unknowns)
+    variances = _variances(residual, end.unknowns, reported)
     ones = jax.tree.map(jnp.ones_like, end.unknowns)
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
     references = model.images.references
@@ -279,17 +283,18 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     without_footprint = eqx.tree_at(lambda r: r.model.corrects, residual, jnp.zeros(()))
     mean = jnp.mean(references, axis=(1, 2), keepdims=True)
     contrast = jnp.mean(residual.weighted(references - mean) ** 2)
+    unexplained = jnp.mean(reported.residual**2)
     share = jnp.mean(jnp.isfinite(residual.scale).astype(contrast.dtype))
     names = ("gamma", "epsilon", "threshold", "scale", "shift", "footprint")
     return DofFit(
         lenses=tuple(model.lens(values, photograph) for photograph in range(len(references))),
-        gain=gain,
-        offset=offset,
-        images=drawn if is_plain else evaluate(without_footprint, end.unknowns)[1],
+        gain=reported.gain,
+        offset=reported.offset,
+        images=reported.drawn if is_plain else evaluate(without_footprint, end.unknowns)[1],
         losses=jnp.stack(end.losses),
         ends=ends,
         standard_errors=standard_errors,
-        explained=jnp.where(contrast > 0, 1 - jnp.mean(rest**2) / contrast, 1) * share,
+        explained=jnp.where(contrast > 0, 1 - unexplained / contrast, 1) * share,
         clamped=jnp.mean(model.circles(values) > model.max_coc),
         iris=model.shape(values),
         result=end.result,
@@ -297,21 +302,21 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     )
 
 
-def _variances(residual: Residual, unknowns: Values, columns: Array, rest: Array) -> Values:
-    """The variance of each unknown, by leaving out tiles, and strata where an effect is biased.
+def _variances(residual: Residual, unknowns: Values, reported: Report) -> Values:
+    """The variance of each unknown, by leaving out tiles, and by what an effect draws wrong.
 
     What an effect draws wrong biases a lens and a depth, which have true values. It biases
     `gamma`, `epsilon` and `threshold` by nothing: those are what makes the effect look most
     like the photograph, and have no others.
     """
-    flat, tree = rest.reshape(-1), ravel_pytree(unknowns)[1]
+    columns, rest, tree = reported.columns, reported.residual, ravel_pytree(unknowns)[1]
     tile, count = tiles(rest.shape[1:])
     tile = jnp.tile(tile, rest.shape[0])
-    variances = tree(jnp.diagonal(covariance(columns, flat, tile, count)))
+    variances = tree(jnp.diagonal(covariance(columns, rest.reshape(-1), tile, count)))
     if residual.is_robust:
-        circles = residual.model.circles(residual.model.values(unknowns))
-        stratum = strata(circles, residual.scale, rest.shape[3])
-        bias = tree(jnp.diagonal(covariance(columns, flat, stratum, 2 * STRATA)))
+        model = residual.model
+        signed = defocus(model, model.values(unknowns)).astype(columns.dtype)
+        bias = tree(_circle_error.variances(columns, reported.widening, signed))
         for name in {*LENS, *DISPARITY, *IRIS}.intersection(variances):
             variances[name] = variances[name] + bias[name]
     return variances

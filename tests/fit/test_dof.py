@@ -221,7 +221,7 @@ def test_what_the_image_does_not_determine_has_a_large_error():
     assert fitted.standard_errors["gamma"] == fitted.standard_errors["epsilon"] == np.inf
     # One plane has one circle of confusion: the aperture or the focus may have made it.
     assert fitted.standard_errors["aperture"] > TRUTH["aperture"]
-    alone = quietly(*behind_the_focus(), parameters=("aperture",))
+    alone = quietly(*behind_the_focus(), parameters=("aperture",), loss="squares")
     assert alone.standard_errors["aperture"] < 0.01 * TRUTH["aperture"]
 
 
@@ -231,7 +231,9 @@ def test_standard_errors_are_the_spread_over_draws_of_noise():
     rng = np.random.default_rng(2)
     misses = []
     for _ in range(24):
-        fitted = quietly(reference + rng.normal(0, 0.01, reference.shape), image, depth)
+        noise = rng.normal(0, 0.01, reference.shape)
+        # The robust loss adds what an effect draws wrong, which is nothing here.
+        fitted = quietly(reference + noise, image, depth, loss="squares")
         values = found(fitted)
         misses.append(
             [(values[name] - TRUTH[name]) / fitted.standard_errors[name] for name in TRUTH]
@@ -413,3 +415,22 @@ def test_several_images_determine_one_aperture():
     # One aperture for both: the second image's error is the first's.
     errors = fitted.standard_errors["aperture"]
     assert float(errors[0]) == pytest.approx(float(errors[1]))
+
+
+@pytest.mark.full
+def test_errors_of_noise_fall_with_the_number_of_photographs_and_others_do_not():
+    """Four photographs through one lens: what the effect draws wrong is wrong in each."""
+    pictures, lenses = focus_pull((3.0,) * 4)
+    _, image, depth = picture()
+    noise = np.random.default_rng(0).normal(0, 0.01, (4, *image.shape))
+    how = {"gamma": TRUTH["gamma"], "epsilon": TRUTH["epsilon"], "max_coc": 8.0}
+    how |= {"parameters": ("aperture",), "ratios": ("aperture",)}
+    errors = {"squares": [], "robust": []}
+    for count, loss in itertools.product((1, 4), errors):
+        noisy = [
+            np.asarray(p) + n for p, n in zip(pictures[:count], noise[:count], strict=True)
+        ]
+        fitted = fit.dof(noisy, image, depth, lenses[:count], loss=loss, **how)
+        errors[loss].append(float(np.ravel(fitted.standard_errors["aperture"])[0]))
+    assert errors["squares"][1] == pytest.approx(errors["squares"][0] / 2, rel=0.3)
+    assert errors["robust"][1] == pytest.approx(errors["robust"][0], rel=0.1)
