@@ -152,7 +152,10 @@ CALLS = {
         shadow.pcss,
         SHADOWED | {"light_camera": FLAT, "size": 3, "light_size": 0.1},
     ),
-    "shadow.variance": (shadow.variance, SHADOWED | {"size": 3, "min_variance": 0.1}),
+    "shadow.variance": (
+        shadow.variance,
+        SHADOWED | {"size": 3, "min_variance": 0.1, "exponents": np.array([8.0, 4.0])},
+    ),
     "relight.shade": (
         relight.shade,
         {"gbuffer": CACHE, "camera": CAMERA, "light": LIGHT, "visibility": LIT},
@@ -390,6 +393,7 @@ MAY_BE_NONE = {
         "slope_bias",
         "visibility",
         "sigma",
+        "exponents",
         "softness",
         "normal",
         "color",

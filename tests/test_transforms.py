@@ -168,6 +168,7 @@ EXAMPLES = {
     "size": [lambda rng, size: 3],
     "dilation": [lambda rng, size: None, lambda rng, size: 2],
     "light_size": [lambda rng, size: np.array(rng.uniform(0.2, 0.3))],
+    "exponents": [lambda rng, size: rng.uniform(2, 4, 2)],
     "min_variance": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "camera": [pinhole, orthographic],
     "target": [pinhole, orthographic],
