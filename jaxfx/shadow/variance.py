@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, WholeNumber, check, parameter
 from jaxfx._meshes import on_any_mesh
-from jaxfx._numerics import safe_divide
+from jaxfx._numerics import absolute, safe_divide
 from jaxfx._sampling import bilinear
 from jaxfx.shadow.arguments import filter_arguments
 from jaxfx.shadow.compare import filter_dtype
@@ -151,7 +151,12 @@ def _variance(shadow_map, receivers, bias, slope_bias, least_variance, exponents
         # A small deviation is stretched by the slope of the warp.
         receiver, stretch = jax.jvp(warp, (behind,), (jnp.ones_like(behind),))
         mean, mean_square = sampled[..., 2 * k], sampled[..., 2 * k + 1]
-        squared_deviation = jnp.maximum(mean_square - mean * mean, least * stretch**2)
+        # The bound is a ratio: in this unit float32 holds the squares in its derivative, too.
+        unit = jax.lax.stop_gradient(jnp.maximum(absolute(receiver), absolute(mean)))
+        unit = jnp.where(unit > 0, unit, 1)
+        receiver, mean, stretch = receiver / unit, mean / unit, stretch / unit
+        spread = mean_square / unit / unit - mean * mean
+        squared_deviation = jnp.maximum(spread, least * stretch**2)
         past = receiver - mean
         bound = safe_divide(squared_deviation, squared_deviation + past * past)
         visibility = jnp.minimum(visibility, jnp.where(is_valid & (past > 0), bound, 1))
