@@ -57,7 +57,7 @@ CACHE = GBuffer(IMAGE, SHADER, IMAGE, IMAGE, IMAGE, NORMAL, DEPTH, ROUGH)
 MAP = np.full((8, 8), 3.0)
 SEEN = shadow.receivers(DEPTH, CAMERA, FLAT)
 TRANSFER = Transfer(
-    np.ones((*SIZE, 2)), np.ones((2, 5)), np.ones((5, 3)), np.ones((5, 3)), np.ones((5, 3))
+    np.ones((*SIZE, 2)), np.ones((2, 5)), *(np.ones((5, 3)) for _ in range(3)), np.ones((5, 5))
 )
 RAYS = np.broadcast_to([4.0, 4.0, 0.0], (2, 3)), np.broadcast_to([0.0, 0, 1], (2, 3))
 STATE = relight.start(CACHE, CAMERA, [LIGHT])

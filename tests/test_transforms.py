@@ -137,6 +137,7 @@ def transfer(rng, size):
         position=rng.uniform(1, 2, (5, 3)),
         normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
         diffuse=rng.uniform(0.1, 1, (5, 3)),
+        exchange=rng.uniform(0.1, 0.2, (5, 5)),
     )
 
 
@@ -187,6 +188,7 @@ EXAMPLES = {
     "max_coc": [lambda rng, size: 6.0],
     "sigma": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "tap_weights": [lambda rng, size: rng.uniform(0.1, 1, 5)],
+    "bounces": [lambda rng, size: 2],
     "slices": [lambda rng, size: 3, lambda rng, size: "all"],
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],

@@ -6,7 +6,7 @@
 | the image under one light alone | `shade(gbuffer, camera, light, visibility)` |
 | edits of one light among ten or more | `start(...)`, then `.edit(i, light)` |
 | edits of materials | `start(...)`, then `.paint(mask, diffuse=...)` |
-| one diffuse bounce | `indirect(gbuffer, scene.transfer(...), lights)` |
+| one diffuse bounce, or several | `indirect(gbuffer, scene.transfer(...), lights)` |
 | a `GBuffer` for a new camera, made of others | `synthesize(gbuffers, cameras, target, ...)` |
 | then its holes filled | `fill_holes(gbuffer, views)` |
 | to know which of many caches to use for it | `choose(gbuffers, cameras, target, ...)` |

@@ -12,7 +12,7 @@
 | masks of objects or materials | `object_ids`, `material_ids` |
 | traced shadows | `visible` |
 | where to put few cameras that see what many see | `plan_views` |
-| one bounce of indirect light | `transfer`, then `relight.indirect` |
+| bounces of indirect light | `transfer`, then `relight.indirect` |
 
 OpenGL or Embree finds the face that every pixel shows; NumPy does the rest. Nothing here can be
 differentiated or traced. World axes are the mesh file's (y up in most of them); cameras are
