@@ -394,6 +394,8 @@ MAY_BE_NONE = {
         "visibility",
         "sigma",
         "exponents",
+        "exchange",
+        "index",
         "softness",
         "normal",
         "color",

@@ -188,6 +188,7 @@ EXAMPLES = {
     "max_coc": [lambda rng, size: 6.0],
     "sigma": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "tap_weights": [lambda rng, size: rng.uniform(0.1, 1, 5)],
+    "index": [lambda rng, size: np.array(rng.uniform(1.3, 1.6))],
     "bounces": [lambda rng, size: 2],
     "slices": [lambda rng, size: 3, lambda rng, size: "all"],
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
