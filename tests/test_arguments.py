@@ -197,6 +197,15 @@ CALLS = {
         relight.fill_holes,
         {"gbuffer": CACHE, "views": np.ones(SIZE, int)},
     ),
+    "relight.mirrored": (relight.mirrored, {"gbuffer": CACHE, "camera": CAMERA}),
+    "relight.refracted": (
+        relight.refracted,
+        {"gbuffer": CACHE, "camera": CAMERA, "index": np.full(SIZE, 1.5)},
+    ),
+    "relight.fresnel": (
+        relight.fresnel,
+        {"gbuffer": CACHE, "camera": CAMERA, "index": np.full(SIZE, 1.5)},
+    ),
     "relight.indirect": (
         relight.indirect,
         {

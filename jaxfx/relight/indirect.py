@@ -42,6 +42,8 @@ def indirect(
       boolean, the share of the light that arrives, or None for all of it. For a point light,
       `scene.visible(mesh, transfer.position, light.position)` computes it. None alone stands
       for no shadows at all.
+    - `bounces`: static; how often light is reflected before it reaches the pixels' surfaces.
+      More than one need `transfer.exchange`.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`; 0 where the
     shader is -1.
