@@ -132,8 +132,10 @@ def _variance(shadow_map, receivers, bias, slope_bias, least_variance, exponents
     # From here on in units of the range, 0 at the nearest depth.
     depth = jnp.pad((depth - near) / scale, size + 1, constant_values=(far - near) / scale)
     behind, least = (threshold - near) / scale, least_variance.astype(dtype) / scale**2
-    warps = [lambda depth: depth]
+    warps, rounding = [lambda depth: depth], 0.0
     if exponents is not None:
+        # Of a mean of equal warped depths, which would shadow its own depth by this.
+        rounding = (2 * size + 8) * float(jnp.finfo(dtype).eps)
         first, second = jnp.clip(exponents.astype(dtype), *_limits(dtype))
         warps = [
             lambda depth: jnp.exp(first * (depth - 0.5)),
@@ -159,7 +161,7 @@ def _variance(shadow_map, receivers, bias, slope_bias, least_variance, exponents
         squared_deviation = jnp.maximum(spread, least * stretch**2)
         past = receiver - mean
         bound = safe_divide(squared_deviation, squared_deviation + past * past)
-        visibility = jnp.minimum(visibility, jnp.where(is_valid & (past > 0), bound, 1))
+        visibility = jnp.minimum(visibility, jnp.where(is_valid & (past > rounding), bound, 1))
     return visibility.astype(receivers.z.dtype)
 
 

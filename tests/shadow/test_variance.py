@@ -94,9 +94,10 @@ def test_the_largest_exponents_of_float32_do_not_overflow():
 
 
 def test_lit_whatever_the_map_says():
-    wall = np.ones((4, 5))
+    wall, warped = np.ones((4, 5)), {"exponents": (80, 10)}
     for u, v, z in [(-9, 2, 5), (99, 2, 5), (2, 2, -1), (np.nan, 2, 5), (2, 2, np.nan)]:
-        assert shadow.variance(wall, at(u, v, z), size=3)[0, 0] == 1
+        for options in ({}, warped):
+            assert shadow.variance(wall, at(u, v, z), size=3, **options)[0, 0] == 1
     assert shadow.variance(np.full((4, 5), np.inf), at(2, 2, 5), size=3)[0, 0] == 1
     assert shadow.variance(wall, at(2.5, 2, 5), size=1)[0, 0] == pytest.approx(0, abs=1e-12)
 
