@@ -88,8 +88,8 @@ def refracted(
     >>> normal, depth = white * jnp.array([0, 0, -1]), jnp.full((8, 8), 3.0)
     >>> wall = GBuffer(white, shader, white, white / 2, white, normal, depth, depth / 6)
     >>> rays = relight.refracted(wall, OrthographicCamera(1.0, [4, 4], jnp.eye(4)))
-    >>> print(rays.directions[4, 4])
-    [0. 0. 1.]
+    >>> print(rays.origins[4, 4], rays.directions[4, 4, 2])
+    [0.5 0.5 3. ] 1.0
 
     Snell's law: the sine of the angle to the normal is divided by `index`. That radiance is
     denser in matter, by `index` squared, is left out: it cancels where the light comes out.

@@ -32,7 +32,8 @@ def floor(y=0.0, half=3.0):
 
 
 def points(gbuffer, rays):
-    return rays.origins + gbuffer.depth[..., None] * rays.directions
+    origins, directions = (np.asarray(field, float) for field in rays)
+    return origins + np.asarray(gbuffer.depth, float)[..., None] * directions
 
 
 def same(found, expected):
@@ -52,8 +53,8 @@ def test_rays_of_a_camera_show_what_the_camera_sees():
     assert alike.mean() > 0.99
     shown = alike & np.isfinite(found.depth)
     assert 70 < shown.sum() < 700
-    gap = points(found, rays) - CAMERA.points(expected.depth)
-    np.testing.assert_allclose(np.asarray(gap)[shown], 0, atol=1e-5)
+    gap = points(found, rays) - np.asarray(CAMERA.points(expected.depth))
+    np.testing.assert_allclose(gap[shown], 0, atol=1e-5)
     doubled = rays._replace(directions=2 * rays.directions)
     half = scene.gbuffer_along(mesh, doubled).depth
     np.testing.assert_allclose(2 * np.asarray(half)[shown], found.depth[shown], rtol=1e-6)
@@ -77,8 +78,8 @@ def test_a_plane_mirror_shows_the_mirrored_cameras_cache():
     assert on_floor.sum() > 300 and alike.mean() > 0.98
     shown = on_floor & same(found, turned) & np.isfinite(np.asarray(turned.depth))
     assert shown.sum() > 40
-    gap = points(found, rays) - other.points(expected.depth)[:, ::-1]
-    np.testing.assert_allclose(np.asarray(gap)[shown], 0, atol=1e-4)
+    gap = points(found, rays) - np.asarray(other.points(expected.depth))[:, ::-1]
+    np.testing.assert_allclose(gap[shown], 0, atol=1e-4)
 
 
 def test_a_pane_shifts_what_is_behind_it():
