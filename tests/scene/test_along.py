@@ -33,7 +33,8 @@ def floor(y=0.0, half=3.0):
 
 def points(gbuffer, rays):
     origins, directions = (np.asarray(field, float) for field in rays)
-    return origins + np.asarray(gbuffer.depth, float)[..., None] * directions
+    depth = np.where(np.isfinite(gbuffer.depth), gbuffer.depth, 0.0)
+    return origins + depth[..., None] * directions
 
 
 def same(found, expected):
