@@ -1,9 +1,11 @@
 """A moving light and a turning camera, from four cached views of a mesh.
 
-Renders four G-buffers of a mesh. From those alone it draws frames in which a spot light moves
-before a camera that stands still, each an edit of one light; then frames in which the camera
-turns, each from a G-buffer synthesized from the four. Shadows come from a shadow map of each
-frame. Writes `relight.gif`, `sheet.png` and `report.json`, with the time of each frame.
+Renders four G-buffers of a mesh, a glTF file for instance. From those alone it draws frames in
+which a spot light moves before a camera that stands still, each an edit of one light; then
+frames in which the camera turns, each from a G-buffer synthesized from the four. Shadows come
+from a shadow map of each frame. With `--environment` the light of all surroundings is added,
+and between the two it turns once about the vertical, each frame an edit of one light. Writes
+`relight.gif`, `sheet.png` and `report.json`, with the time of each frame.
 """
 
 import argparse
@@ -23,7 +25,17 @@ import numpy as np
 from _begin import fail, make_folder
 from PIL import Image
 
-from jaxfx import PinholeCamera, SpotLight, io, metrics, relight, reproject, scene, shadow
+from jaxfx import (
+    EnvironmentLight,
+    PinholeCamera,
+    SpotLight,
+    io,
+    metrics,
+    relight,
+    reproject,
+    scene,
+    shadow,
+)
 from jaxfx._files import write_whole
 
 
@@ -36,6 +48,11 @@ import matplotlib.pyplot as plt
 STATIONS = ((-0.2, 0.0), (0.2, 0.0), (0.0, 0.15), (0.0, -0.05))
 TURN = 0.15
 MAP_SIZE = 512
+# Rows of the surroundings: a larger picture is averaged to at most this many. More show in
+# mirrors alone.
+SKY_ROWS = 128
+# The mean radiance to which the surroundings are scaled: files come in any unit.
+SKY_MEAN = 0.25
 
 
 def parse() -> argparse.Namespace:
@@ -43,8 +60,21 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", type=Path, help="a mesh; without it, a still life")
+    parser.add_argument(
+        "--environment",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help="light from a panorama, .exr, .hdr, .png or .jpg, twice as wide as high, which "
+        "turns; without a file, from a sky of our own",
+    )
     parser.add_argument("--size", type=int, default=480, help="height of the image, pixels")
-    parser.add_argument("--frames", type=int, default=32, help="half of them for the light")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        default=32,
+        help="half of them for the light, or a third where surroundings turn too",
+    )
     parser.add_argument(
         "--depth",
         choices=("mesh", "warp"),
@@ -53,7 +83,7 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
     arguments = parser.parse_args()
-    for name, least in (("size", 16), ("frames", 2)):
+    for name, least in (("size", 16), ("frames", 2 if arguments.environment is None else 3)):
         if getattr(arguments, name) < least:
             parser.error(f"--{name} must be at least {least}, got {getattr(arguments, name)}")
     return arguments
@@ -72,9 +102,7 @@ class Stage(NamedTuple):
         """The camera moved about the target, as far from it as before."""
         pose = np.asarray(self.camera.world_from_camera, np.float64)
         offset = pose[:3, 3] - self.target
-        sine, cosine = np.sin(angle), np.cos(angle)
-        turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-        eye = turn @ offset
+        eye = about_vertical(angle) @ offset
         eye[1] += rise * np.linalg.norm(offset)
         eye *= np.linalg.norm(offset) / np.linalg.norm(eye)
         focal = float(self.camera.intrinsics[1, 1])
@@ -117,6 +145,81 @@ def set_stage(path: Path | None, height: int) -> Stage:
     except (OSError, ValueError, RuntimeError) as error:
         fail(error)
     return stage
+
+
+def surroundings(path: str) -> EnvironmentLight:
+    """The light of a panorama, or of a sky with a low sun; a bad file ends the program."""
+    try:
+        picture = panorama(path) if path else sky()
+        rows = picture.shape[0]
+        step = -(-rows // SKY_ROWS)
+        if picture.shape[1] != 2 * rows:
+            raise ValueError(
+                f"{path!r} must be twice as wide as high, got {picture.shape[:2]}."
+            )
+        if step > 1:  # Rows that are left over, at the nadir, are dropped.
+            kept = rows // step
+            picture = picture[: kept * step, : 2 * kept * step, :3]
+            picture = picture.reshape(kept, step, 2 * kept, step, 3).mean(axis=(1, 3))
+        return EnvironmentLight(picture, color=np.full(3, SKY_MEAN / picture.mean()))
+    except (OSError, ValueError, RuntimeError) as error:
+        fail(error)
+
+
+def panorama(path: str) -> np.ndarray:
+    """A picture of all directions, linear; negative numbers, from a resampling say, are 0."""
+    if Path(path).suffix.lower() == ".hdr":
+        picture = radiance(Path(path).read_bytes(), path)
+    else:
+        picture = io.read_color(path)
+    if picture.shape[2] < 3:  # Gray, and perhaps its alpha.
+        picture = np.repeat(picture[..., :1], 3, axis=2)
+    return np.maximum(picture[..., :3], 0)
+
+
+def radiance(data: bytes, path: str) -> np.ndarray:
+    """The picture in a Radiance file of the usual kind: rows from the top, run-length coded."""
+    header, mark, body = data.partition(b"\n\n")
+    size, newline, body = body.partition(b"\n")
+    words = size.split()
+    if not (header.startswith(b"#?") and mark and newline and len(words) == 4):
+        raise ValueError(f"{path!r} is no Radiance picture.")
+    if words[0] != b"-Y" or words[2] != b"+X" or b"rgbe" not in header:
+        raise ValueError(f"{path!r} must be of -Y +X rgbe, got {size.decode('latin-1')!r}.")
+    height, width = int(words[1]), int(words[3])
+    texels, at = np.zeros((height, 4, width), np.uint8), 0
+    try:
+        for row in texels:
+            if body[at : at + 4] != bytes([2, 2, width >> 8, width & 255]):
+                raise ValueError(f"{path!r} must be run-length coded by channels.")
+            at += 4
+            for channel in row:
+                done = 0
+                while done < width:
+                    count, at = body[at], at + 1
+                    is_run, count = count > 128, count - 128 * (count > 128)
+                    used = 1 if is_run else count
+                    channel[done : done + count] = np.frombuffer(body, np.uint8, used, at)
+                    done, at = done + count, at + used
+    except IndexError:
+        raise ValueError(f"{path!r} ends early.") from None
+    scale = np.ldexp(1.0, texels[:, 3].astype(int) - 136)
+    return np.moveaxis(texels[:, :3] * scale[:, None], 1, -1)
+
+
+def sky() -> np.ndarray:
+    """A blue sky, a low sun behind haze, brown ground."""
+    rows, columns = np.mgrid[:SKY_ROWS, : 2 * SKY_ROWS] + 0.5
+    above, right = np.pi * (0.5 - rows / SKY_ROWS), np.pi * (columns / SKY_ROWS - 1)
+    to_sun = np.cos(above) * np.cos(right - 0.8) * np.cos(0.4) + np.sin(above) * np.sin(0.4)
+    is_up = (0.5 + 0.5 * np.tanh(6 * np.sin(above)))[..., None]
+    picture = is_up * np.array([0.4, 0.6, 1.0]) + (1 - is_up) * np.array([0.25, 0.18, 0.12])
+    return picture + np.exp(30 * (to_sun - 1))[..., None] * np.array([12.0, 9.5, 6.5])
+
+
+def about_vertical(angle: float) -> np.ndarray:
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
 
 
 @jax.jit
@@ -177,12 +280,14 @@ class Clock:
 class Studio:
     """Four caches, and the state of the view that is shown."""
 
-    def __init__(self, stage: Stage, depth: str):
+    def __init__(self, stage: Stage, depth: str, around: EnvironmentLight | None):
         self.stage, self.depth = stage, depth
         self.cameras = [stage.turned(*station) for station in STATIONS]
         self.caches = [stage.gbuffer(camera) for camera in self.cameras]
         self.lights = scene.default_lights(stage.camera)
         self.others = [*self.lights[1:]]  # The key light is the one that moves.
+        if around is not None:
+            self.others = [around]
 
     def view(self, camera, light, clock):
         """A new view: its cache is synthesized, and every light shaded."""
@@ -205,6 +310,14 @@ class Studio:
         )
         return clock("image", lambda: self.state.image), int(holes)
 
+    def turn(self, angle, clock):
+        """The same view with the surroundings turned: one light is edited."""
+        (around,) = self.others
+        assert isinstance(around, EnvironmentLight)
+        turned = around.turned(about_vertical(angle))
+        self.state = clock("edit", lambda: self.state.edit(1, turned))
+        return clock("image", lambda: self.state.image)
+
     def move(self, light, clock):
         """The same view with the light elsewhere: one light is edited."""
         lit = clock("shadow", lambda: visibility(self.stage, self.gbuffer, self.camera, light))
@@ -214,19 +327,24 @@ class Studio:
 
 def play(studio: Studio, frames: int) -> tuple[list, list]:
     """The image of every frame, and its record for the report."""
-    stage, half = studio.stage, frames // 2
-    first = stage.light(0.0)
+    stage, first = studio.stage, studio.stage.light(0.0)
+    turns = isinstance(studio.others[0], EnvironmentLight)
+    moved, total = (frames // 3, frames - frames // 3) if turns else (frames // 2, frames // 2)
     for _ in range(2):  # The second time nothing is left to compile.
         studio.view(stage.turned(0.0, 0.02), first, Clock())
         studio.move(first, Clock())
+        if turns:
+            studio.turn(0.0, Clock())
     images, records = [], []
     for frame in range(frames):
-        clock, kind = Clock(), "edit" if frame < half else "new view"
-        if frame < half:
-            light, holes = stage.light(frame / half), 0
-            image = studio.move(light, clock)
+        clock, holes = Clock(), 0
+        if frame < moved:
+            kind, image = "edit", studio.move(stage.light(frame / moved), clock)
+        elif frame < total:
+            angle = 2 * np.pi * (frame - moved) / (total - moved)
+            kind, image = "turned surroundings", studio.turn(angle, clock)
         else:
-            phase = 2 * np.pi * (frame - half) / (frames - half)
+            kind, phase = "new view", 2 * np.pi * (frame - total) / (frames - total)
             camera = stage.turned(TURN * np.sin(phase), 0.02 + 0.03 * (1 - np.cos(phase)))
             image, holes = studio.view(camera, first, clock)
         images.append(np.asarray(image))
@@ -247,7 +365,7 @@ def psnr_to_fresh_cache(studio: Studio, image) -> float:
     truth = studio.stage.gbuffer(studio.camera)
     light = studio.state.lights[0]
     lit = visibility(studio.stage, truth, studio.camera, light)
-    lights, visible = [light, *studio.others], [lit, *(None for _ in studio.others)]
+    lights, visible = [*studio.state.lights], [lit, *(None for _ in studio.others)]
     fresh = relight.start(truth, studio.camera, lights, visibilities=visible).image
     return float(metrics.psnr(image, fresh))
 
@@ -306,7 +424,8 @@ def main() -> None:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("jaxfx").setLevel(logging.INFO)
     out = make_folder(arguments.out)
-    studio = Studio(set_stage(arguments.scene, arguments.size), arguments.depth)
+    around = None if arguments.environment is None else surroundings(arguments.environment)
+    studio = Studio(set_stage(arguments.scene, arguments.size), arguments.depth, around)
     images, records = play(studio, arguments.frames)
     write_gif(images, out / "relight.gif")
     write_sheet(images, records, out / "sheet.png")
@@ -320,7 +439,7 @@ def main() -> None:
     write_whole(out / "report.json", json.dumps(report, indent=2).encode())
     for kind, median in report["median"].items():
         steps = ", ".join(f"{name} {value:.1f}" for name, value in median["steps"].items())
-        print(f"{kind:9}{median['milliseconds']:7.1f} ms ({steps}), {median['psnr']:.1f} dB")
+        print(f"{kind:20}{median['milliseconds']:7.1f} ms ({steps}), {median['psnr']:.1f} dB")
     print(f"images and report in {out}")
 
 

@@ -25,6 +25,8 @@ class Transfer(eqx.Module):
     - `position`: point 3, world space.
     - `normal`: point 3, unit vectors in world space.
     - `diffuse`: point 3, linear RGB reflectance.
+    - `exchange`: point point, ratios: what the points (rows) get of what the points (columns)
+      send. None where light bounces once only.
 
     **Raises:** `ValueError` where the shapes do not fit one another.
 
@@ -40,7 +42,8 @@ class Transfer(eqx.Module):
     (8, 8, 3)
 
     The irradiance of the pixels from the points is `receive @ (send @ b)`, a low-rank matrix
-    product, where `b` is what each point sends back: its irradiance times its `diffuse`.
+    product, where `b` is what each point sends back: its irradiance times its `diffuse`. The
+    irradiance of the points from one another is `exchange @ b`.
 
     Source: Hasan, Pellacini & Bala 2006, direct-to-indirect transfer.
     """
@@ -50,8 +53,17 @@ class Transfer(eqx.Module):
     position: Float[Array, "point 3"]
     normal: Float[Array, "point 3"]
     diffuse: Float[Array, "point 3"]
+    exchange: Float[Array, "point point"] | None
 
-    def __init__(self, receive: Any, send: Any, position: Any, normal: Any, diffuse: Any):
+    def __init__(
+        self,
+        receive: Any,
+        send: Any,
+        position: Any,
+        normal: Any,
+        diffuse: Any,
+        exchange: Any = None,
+    ):
         self.receive = parameter("Transfer(receive)", receive, None)
         self.send = parameter("Transfer(send)", send, None)
         shape = self.send.shape
@@ -65,3 +77,6 @@ class Transfer(eqx.Module):
         self.position = parameter("Transfer(position)", position, (shape[1], 3))
         self.normal = parameter("Transfer(normal)", normal, (shape[1], 3))
         self.diffuse = parameter("Transfer(diffuse)", diffuse, (shape[1], 3))
+        self.exchange = exchange
+        if exchange is not None:
+            self.exchange = parameter("Transfer(exchange)", exchange, (shape[1], shape[1]))

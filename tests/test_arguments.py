@@ -57,7 +57,7 @@ CACHE = GBuffer(IMAGE, SHADER, IMAGE, IMAGE, IMAGE, NORMAL, DEPTH, ROUGH)
 MAP = np.full((8, 8), 3.0)
 SEEN = shadow.receivers(DEPTH, CAMERA, FLAT)
 TRANSFER = Transfer(
-    np.ones((*SIZE, 2)), np.ones((2, 5)), np.ones((5, 3)), np.ones((5, 3)), np.ones((5, 3))
+    np.ones((*SIZE, 2)), np.ones((2, 5)), *(np.ones((5, 3)) for _ in range(3)), np.ones((5, 5))
 )
 RAYS = np.broadcast_to([4.0, 4.0, 0.0], (2, 3)), np.broadcast_to([0.0, 0, 1], (2, 3))
 STATE = relight.start(CACHE, CAMERA, [LIGHT])
@@ -152,7 +152,10 @@ CALLS = {
         shadow.pcss,
         SHADOWED | {"light_camera": FLAT, "size": 3, "light_size": 0.1},
     ),
-    "shadow.variance": (shadow.variance, SHADOWED | {"size": 3, "min_variance": 0.1}),
+    "shadow.variance": (
+        shadow.variance,
+        SHADOWED | {"size": 3, "min_variance": 0.1, "exponents": np.array([8.0, 4.0])},
+    ),
     "relight.shade": (
         relight.shade,
         {"gbuffer": CACHE, "camera": CAMERA, "light": LIGHT, "visibility": LIT},
@@ -193,6 +196,15 @@ CALLS = {
     "relight.fill_holes": (
         relight.fill_holes,
         {"gbuffer": CACHE, "views": np.ones(SIZE, int)},
+    ),
+    "relight.mirrored": (relight.mirrored, {"gbuffer": CACHE, "camera": CAMERA}),
+    "relight.refracted": (
+        relight.refracted,
+        {"gbuffer": CACHE, "camera": CAMERA, "index": np.full(SIZE, 1.5)},
+    ),
+    "relight.fresnel": (
+        relight.fresnel,
+        {"gbuffer": CACHE, "camera": CAMERA, "index": np.full(SIZE, 1.5)},
     ),
     "relight.indirect": (
         relight.indirect,
@@ -390,6 +402,9 @@ MAY_BE_NONE = {
         "slope_bias",
         "visibility",
         "sigma",
+        "exponents",
+        "exchange",
+        "index",
         "softness",
         "normal",
         "color",

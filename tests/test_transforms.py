@@ -137,6 +137,7 @@ def transfer(rng, size):
         position=rng.uniform(1, 2, (5, 3)),
         normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
         diffuse=rng.uniform(0.1, 1, (5, 3)),
+        exchange=rng.uniform(0.1, 0.2, (5, 5)),
     )
 
 
@@ -168,6 +169,7 @@ EXAMPLES = {
     "size": [lambda rng, size: 3],
     "dilation": [lambda rng, size: None, lambda rng, size: 2],
     "light_size": [lambda rng, size: np.array(rng.uniform(0.2, 0.3))],
+    "exponents": [lambda rng, size: rng.uniform(2, 4, 2)],
     "min_variance": [lambda rng, size: np.array(rng.uniform(0.1, 0.2))],
     "camera": [pinhole, orthographic],
     "target": [pinhole, orthographic],
@@ -186,6 +188,8 @@ EXAMPLES = {
     "max_coc": [lambda rng, size: 6.0],
     "sigma": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "tap_weights": [lambda rng, size: rng.uniform(0.1, 1, 5)],
+    "index": [lambda rng, size: np.array(rng.uniform(1.3, 1.6))],
+    "bounces": [lambda rng, size: 2],
     "slices": [lambda rng, size: 3, lambda rng, size: "all"],
     "edge": [lambda rng, size: np.array(rng.uniform(1, 2))],
     "threshold": [lambda rng, size: np.array(rng.uniform(1, 2))],

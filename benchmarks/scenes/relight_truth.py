@@ -159,17 +159,17 @@ def direct(mesh, camera, light, size, *, shadows):
     return np.pi * image.reshape(*size, 3)
 
 
-def bounced(mesh, camera, light, size, samples, *, seed=0):
-    """The image of one bounce of indirect light, and its standard error, by path tracing."""
+def bounced(mesh, camera, light, size, samples, *, seed=0, bounces=1):
+    """The image of so many bounces of indirect light, and its standard error, by paths."""
     world = mi.load_dict({"type": "scene", **shapes(mesh), "light": emitter(light)})
     path = lambda depth: mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
-    once, twice = path(2), path(3)
+    once, more = path(2), path(2 + bounces)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed)
     image, noise = (np.zeros((size[0] * size[1], 3)) for _ in range(2))
     for pixel, ray in enumerate(rays(camera, size)):
         direct_light = np.array(once.sample(world, sampler, ray)[0])
-        paths = [twice.sample(world, sampler, ray)[0] for _ in range(samples)]
+        paths = [more.sample(world, sampler, ray)[0] for _ in range(samples)]
         paths = np.array(paths, float).reshape(samples, 3)
         image[pixel] = paths.mean(axis=0) - direct_light
         noise[pixel] = paths.std(axis=0) / np.sqrt(samples)

@@ -80,6 +80,21 @@ def plate(magnification, width, side=96, texels=64):
     return shadow_map, shadow.Receivers(*map(jnp.asarray, (u, v, np.full_like(u, 4.0), 0 * u)))
 
 
+def slats(side: int = 96) -> tuple[np.ndarray, shadow.Receivers]:
+    """Occluders over one another above a floor at depth 4, and receivers on all of it.
+
+    Slats at 1 above a table at 3 that covers the left half; below, slats at 2 about an edge,
+    behind which the map sees 9.
+    """
+    y, x = np.mgrid[:side, :side] + 0.5
+    shadow_map = np.where(x < side / 2, 3.0, 4.0)
+    shadow_map[(x // 12 % 2 == 0) & (y < 0.6 * side)] = 1.0
+    below = np.where(x // 8 % 2 == 0, 2.0, 9.0)
+    shadow_map = np.where(y > 0.8 * side, below, shadow_map).astype(np.float32)
+    fields = (x + 0.3, y + 0.2, np.full_like(x, 4.0), 0 * x)
+    return shadow_map, shadow.Receivers(*(jnp.asarray(f, jnp.float32) for f in fields))
+
+
 class Still:
     """A view of the still life: its depth, normals and points, and rays traced from these."""
 

@@ -6,7 +6,8 @@
 | the image under one light alone | `shade(gbuffer, camera, light, visibility)` |
 | edits of one light among ten or more | `start(...)`, then `.edit(i, light)` |
 | edits of materials | `start(...)`, then `.paint(mask, diffuse=...)` |
-| one diffuse bounce | `indirect(gbuffer, scene.transfer(...), lights)` |
+| one diffuse bounce, or several | `indirect(gbuffer, scene.transfer(...), lights)` |
+| what mirrors and glass show | `mirrored` or `refracted`, `scene.gbuffer_along`, `fresnel` |
 | a `GBuffer` for a new camera, made of others | `synthesize(gbuffers, cameras, target, ...)` |
 | then its holes filled | `fill_holes(gbuffer, views)` |
 | to know which of many caches to use for it | `choose(gbuffers, cameras, target, ...)` |
@@ -24,6 +25,7 @@ from jaxfx.relight.choose import choose
 from jaxfx.relight.holes import FilledCache, fill_holes
 from jaxfx.relight.indirect import indirect
 from jaxfx.relight.normals import capture_normals
+from jaxfx.relight.rays import fresnel, mirrored, refracted
 from jaxfx.relight.shading import render, shade
 from jaxfx.relight.state import RelightState, start
 from jaxfx.relight.synthesize import Synthesis, synthesize
@@ -37,7 +39,10 @@ __all__ = [
     "capture_normals",
     "choose",
     "fill_holes",
+    "fresnel",
     "indirect",
+    "mirrored",
+    "refracted",
     "render",
     "shade",
     "start",

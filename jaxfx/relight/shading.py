@@ -21,14 +21,14 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfx import _environment
 from jaxfx._arguments import alike, check_camera, check_gbuffer, check_light, check_lights
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import check, is_concrete, share, shares
+from jaxfx._checks import check, is_concrete, parameter, share, shares
 from jaxfx._harmonics import irradiance as harmonic_irradiance
 from jaxfx._loops import scan
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
 from jaxfx._platform import by_platform
 from jaxfx._sampling import pixel_centers
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import Camera, OrthographicCamera, PinholeCamera, Rays
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import (
     AmbientLight,
@@ -61,7 +61,7 @@ _LEAST_ROUGHNESS = 1e-4
 @on_any_mesh
 def shade(
     gbuffer: GBuffer,
-    camera: PinholeCamera | OrthographicCamera,
+    camera: PinholeCamera | OrthographicCamera | Rays,
     light: Light,
     visibility: Float[ArrayLike, "height width"]
     | Bool[ArrayLike, "height width"]
@@ -73,7 +73,8 @@ def shade(
 
     **Arguments:**
 
-    - `gbuffer`, `camera`: the cache, height width, and the camera that it was made with.
+    - `gbuffer`, `camera`: the cache, height width, and the camera that it was made with; or the
+      rays, of a cache from `scene.gbuffer_along`.
     - `light`: of any kind.
     - `visibility`: height width, in [0, 1] or booleans: the share of the light that arrives,
       from a filter of `jaxfx.shadow` for instance. Left out, all of it arrives.
@@ -136,7 +137,7 @@ def shade(
 @on_any_mesh
 def render(
     gbuffer: GBuffer,
-    camera: PinholeCamera | OrthographicCamera,
+    camera: PinholeCamera | OrthographicCamera | Rays,
     lights: Sequence[Light],
     *,
     visibilities: Sequence[Any] | None = None,
@@ -205,9 +206,7 @@ def has_ggx(gbuffer: GBuffer) -> bool:
     return not is_concrete(gbuffer.shader) or bool((np.asarray(gbuffer.shader) == _GGX).any())
 
 
-def to_surface(
-    gbuffer: GBuffer, camera: PinholeCamera | OrthographicCamera, with_ggx: bool
-) -> Surface:
+def to_surface(gbuffer: GBuffer, camera: Camera | Rays, with_ggx: bool) -> Surface:
     """The surface of a cache; where there is none, shader -1 and finite stand-ins.
 
     `with_ggx` is static: `has_ggx` of the cache.
@@ -223,10 +222,14 @@ def to_surface(
         return jnp.where(mask, field.astype(dtype), stand_in)
 
     depth = masked(gbuffer.depth, 1)
-    pixels = pixel_centers(depth.shape[0], depth.shape[1], dtype)
-    position = camera.unproject(pixels, depth)
-    # At depth 0 lies the eye, or the start of an orthographic ray.
-    to_camera = camera.unproject(pixels, jnp.zeros_like(depth)) - position
+    if isinstance(camera, Rays):
+        origins, directions = (masked(field, 0) for field in camera)
+        position, to_camera = origins + depth[..., None] * directions, -directions
+    else:
+        pixels = pixel_centers(depth.shape[0], depth.shape[1], dtype)
+        position = camera.unproject(pixels, depth)
+        # At depth 0 lies the eye, or the start of an orthographic ray.
+        to_camera = camera.unproject(pixels, jnp.zeros_like(depth)) - position
     normal, to_camera = _unit(masked(gbuffer.normal, 0)), _unit(to_camera)
     return Surface(
         shader=jnp.where(is_surface, shader, _NOTHING),
@@ -409,12 +412,17 @@ def _unit(vector: _Vectors) -> _Vectors:
 
 
 def check_cache(function: str, gbuffer: Any, camera: Any) -> GBuffer:
-    """The cache of a camera; `ValueError` where one of the two is wrong.
+    """The cache of a camera, or of rays; `ValueError` where one of the two is wrong.
 
     It is constructed again, which checks its shapes: it may have been edited as a pytree.
     """
-    check_camera(f"{function}(camera)", camera)
-    return check_shader(check_gbuffer(f"{function}(gbuffer)", gbuffer))
+    if not isinstance(camera, Rays):
+        check_camera(f"{function}(camera)", camera)
+    gbuffer = check_shader(check_gbuffer(f"{function}(gbuffer)", gbuffer))
+    if isinstance(camera, Rays):
+        for name, field in zip(Rays._fields, camera, strict=True):
+            parameter(f"{function}(camera.{name})", field, (*gbuffer.depth.shape, 3))
+    return gbuffer
 
 
 def check_shader(gbuffer: GBuffer) -> GBuffer:

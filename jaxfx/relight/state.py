@@ -19,7 +19,7 @@ from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array, parameter, share, shares, whole_number
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
-from jaxfx.camera import OrthographicCamera, PinholeCamera
+from jaxfx.camera import OrthographicCamera, PinholeCamera, Rays
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight._sums import Sums, image_of, sums_of_none, with_lights
@@ -35,7 +35,7 @@ _to_surface = jax.jit(to_surface, static_argnums=2)
 @on_any_mesh
 def start(
     gbuffer: GBuffer,
-    camera: PinholeCamera | OrthographicCamera,
+    camera: PinholeCamera | OrthographicCamera | Rays,
     lights: Sequence[Light],
     *,
     visibilities: Sequence[Any] | None = None,

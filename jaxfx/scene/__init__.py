@@ -9,16 +9,18 @@
 | shading parameters to light with `jaxfx.relight` | `gbuffer` |
 | depth alone: for `jaxfx.dof`, or a shadow map | `depth` |
 | the surface behind the first one | `gbuffer` or `depth` with `layer_index=1` |
+| what mirrors and clear bodies show | `gbuffer_along`, of `relight.mirrored` or `.refracted` |
 | masks of objects or materials | `object_ids`, `material_ids` |
 | traced shadows | `visible` |
 | where to put few cameras that see what many see | `plan_views` |
-| one bounce of indirect light | `transfer`, then `relight.indirect` |
+| bounces of indirect light | `transfer`, then `relight.indirect` |
 
 OpenGL or Embree finds the face that every pixel shows; NumPy does the rest. Nothing here can be
 differentiated or traced. World axes are the mesh file's (y up in most of them); cameras are
 those of `jaxfx`.
 """
 
+from jaxfx.scene._along import gbuffer_along
 from jaxfx.scene._defaults import default_camera, default_lights
 from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._material import Material, Sampler
@@ -40,6 +42,7 @@ __all__ = [
     "depth",
     "from_trimesh",
     "gbuffer",
+    "gbuffer_along",
     "load",
     "material_ids",
     "object_ids",

@@ -61,10 +61,26 @@ def intersect(scene: Scene, view: View, faces: Int[np.ndarray, "height width"]) 
     Source: Möller & Trumbore 1997.
     """
     pixel = np.flatnonzero(faces >= 0)
-    face = faces.take(pixel)
     origin, toward = (rays.take(pixel, axis=1) for rays in view.rays(*faces.shape))
-    corners = view.to_camera(scene.vertices)
-    a, b, c = (corners.take(scene.faces[:, i].take(face), axis=1) for i in range(3))
+    corners, axis = view.to_camera(scene.vertices), np.array([[0.0], [0], [1]])
+    return meet(scene, corners, pixel, faces.take(pixel), (origin, toward), axis)
+
+
+def meet(
+    scene: Scene,
+    vertices: Float[np.ndarray, "3 vertex"],
+    pixel: Int[np.ndarray, " hit"],
+    face: Int[np.ndarray, " hit"],
+    rays: tuple[Float[np.ndarray, "3 hit"], Float[np.ndarray, "3 hit"]],
+    axis: Float[np.ndarray, "3 #hit"],
+) -> Hits:
+    """The hits of rays (origin, direction) with the faces of pixels, in the rays' space.
+
+    `vertices` are the scene's in that space. The depth is along `axis`, from the origin, over
+    the direction's own.
+    """
+    origin, toward = rays
+    a, b, c = (vertices.take(scene.faces[:, i].take(face), axis=1) for i in range(3))
     ab, ac, offset = b - a, c - a, origin - a
     normal = _cross(ab, ac)
     # The determinant of the edges and the ray; 0 where the face is seen edge-on.
@@ -74,7 +90,8 @@ def intersect(scene: Scene, view: View, faces: Int[np.ndarray, "height width"]) 
     weight_b = _dot(ac, swept) / volume
     weight_c = -_dot(ab, swept) / volume
     weights = np.stack([1 - weight_b - weight_c, weight_b, weight_c])
-    depth = _dot(_at_least(-_SLACK, weights), (a[2], b[2], c[2]))
+    along = (_dot(axis, corner - origin) for corner in (a, b, c))
+    depth = _dot(_at_least(-_SLACK, weights), [*along]) / _dot(axis, toward)
     return Hits(pixel, face, depth, _at_least(0, weights), _unit(normal), toward)
 
 

@@ -1,4 +1,4 @@
-"""One bounce of light: which points see each other, and the transfer from surfaces to pixels.
+"""Bounces of light: which points see each other, the transfer from surfaces to pixels.
 
 Sample points stand for the surfaces that reflect light. Candidates are drawn uniformly from the
 mesh; those that send much light to the image are kept more often. Each sample stands for a disc
@@ -98,10 +98,10 @@ def transfer(
     rank: int = 64,
     seed: int = 0,
 ) -> Transfer:
-    """How light that surfaces reflect diffusely, one bounce, reaches each pixel.
+    """How light that surfaces reflect diffusely reaches each pixel, and one another.
 
-    It is computed once per view. `relight.indirect` then computes the bounce of any lights by a
-    matrix product.
+    It is computed once per view. `relight.indirect` then computes the bounces of any lights by
+    matrix products.
 
     **Arguments:**
 
@@ -163,7 +163,8 @@ def transfer(
     receive = np.zeros((height, width, rank), np.float32)
     blocks = _blocks(scene, position, normal, samples)
     receive[is_surface] = np.concatenate([block @ send.T for block in blocks])
-    fields = (send, samples.position, samples.normal, samples.diffuse)
+    exchange = np.concatenate([*_blocks(scene, samples.position, samples.normal, samples)])
+    fields = (send, samples.position, samples.normal, samples.diffuse, exchange)
     return Transfer(receive, *(np.asarray(field, np.float32) for field in fields))
 
 

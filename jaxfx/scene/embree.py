@@ -62,6 +62,18 @@ def first_faces(
     return faces
 
 
+def first_along(
+    scene: Scene,
+    start: Float[np.ndarray, "ray 3"],
+    direction: Float[np.ndarray, "ray 3"],
+) -> Int[np.ndarray, " ray"]:
+    """The first face along rays of unit directions that may begin on surfaces; -1 for none."""
+    start = (start - scene.center) / scene.radius + _INSET * direction
+    return accelerated(scene).run(
+        np.ascontiguousarray(start, np.float32), np.ascontiguousarray(direction, np.float32)
+    )
+
+
 def unobstructed(
     scene: Scene,
     start: Float[np.ndarray, "ray 3"],

@@ -12,14 +12,14 @@ find the `receivers`, filter; then hand the visibility to `jaxfx.relight`.
 | edges that do not jump as things move | `edge_pcf(..., kernel="tent")` |
 | edges that are wider away from the occluder | `pcss(..., light_camera, light_size=...)` |
 | gradients | `edge_pcf(..., softness=...)`, `pcss(..., softness=...)` |
+| a cost that does not grow with the filter | `variance(..., exponents=(80, 10))` |
 | the quickest within an error | `jaxfx.budget.shadow(..., max_error=...)` |
 | the pixels that `edge_pcf` filters | `candidates(shadow_map, receivers, size=...)` |
 
 Kept for comparison: `pcf`, which filters every pixel, to the same result as `edge_pcf`;
 `edge_pcf(edges="screen")`, the published search for edges in the image, which misses thin
 shadows; `prefiltered`, which averages depths before it compares them, the wrong order;
-`variance`, whose cost does not grow with the filter, and which leaks light where occluders
-overlap.
+`variance` without `exponents`, which leaks light where occluders overlap.
 """
 
 from jaxfx.shadow.cameras import light_cameras

@@ -7,7 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.scenes.shadow import Still, acne_and_leaks, noise, plate, steps, two_discs
+from benchmarks.scenes.shadow import (
+    Still,
+    acne_and_leaks,
+    noise,
+    plate,
+    slats,
+    steps,
+    two_discs,
+)
 from jaxfx import OrthographicCamera, shadow
 from tests.cases.registry import Found, case
 
@@ -105,8 +113,9 @@ FILTERS: dict[str, Any] = {
     "edge_pcf": ft.partial(shadow.edge_pcf, size=3, edges="depth"),
     "pcss": lambda *data: shadow.pcss(*data, CAMERA, size=3, light_size=0.1),
     "variance": ft.partial(shadow.variance, size=3),
+    "variance, exponents 80 and 10": ft.partial(shadow.variance, size=3, exponents=(80, 10)),
 }
-SOFT = ("pcf, soft Gaussian", "pcss", "variance")
+SOFT = ("pcf, soft Gaussian", "pcss", "variance", "variance, exponents 80 and 10")
 
 
 @case(
@@ -137,6 +146,27 @@ def outside_of_the_map(method):
         "spoilt": float((np.asarray(run(broken, far)) != before).sum()),
     }
     return Found(figures, np.reshape(visible, (3, 4)))
+
+
+WARPS: dict[str, Any] = {"variance": None} | {
+    f"variance, exponents {c} and {d}": (c, d) for c, d in ((20, 5), (40, 10), (80, 10))
+}
+
+
+@case("shadow", {"slats": 0.01, "still life": 0.01, "acne": 0.01, "off": None}, WARPS)
+def occluders_over_one_another(method):
+    """A filter of 9x9 where `pcf` of 11x11 finds no lit texel: the largest visibility below
+    slats above a table, and in the still life under the sun; where it finds no dark one, the
+    largest darkness; the root mean square distance to `pcf` of 9x9 in the picture."""
+    off, leaks, acne, picture = 0.0, {}, 0.0, None
+    for name, data in (("still life", _sunlit()[0]), ("slats", slats())):
+        bias = {"bias": 0.02, "slope_bias": 5.0} if name == "still life" else {}
+        picture = np.asarray(shadow.variance(*data, size=9, exponents=WARPS[method], **bias))
+        reference, wide = (np.asarray(shadow.pcf(*data, size=n, **bias)) for n in (9, 11))
+        leaks[name] = float(picture[wide == 0].max())
+        acne = max(acne, float(1 - picture[wide == 1].min()))
+        off = float(np.sqrt(np.mean((picture - reference) ** 2)))
+    return Found(leaks | {"acne": acne, "off": off}, picture)
 
 
 COUNTED = {

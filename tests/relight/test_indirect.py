@@ -3,6 +3,8 @@
 import inspect
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from jaxfx import (
     Transfer,
     relight,
 )
+from tests.helpers.quick import check_slopes
 
 
 RNG = np.random.default_rng(0)
@@ -35,6 +38,7 @@ TRANSFER = Transfer(
     position=RNG.normal(size=(POINTS, 3)),
     normal=NORMAL / np.linalg.norm(NORMAL, axis=1, keepdims=True),
     diffuse=RNG.uniform(size=(POINTS, 3)),
+    exchange=RNG.uniform(size=(POINTS, POINTS)) / POINTS,
 )
 SPOT = SpotLight([0, 0, 4.0], [0, 0, -1.0], [3, 2, 1.0], 1.0, 1.2)
 LIGHTS = [
@@ -74,6 +78,37 @@ def test_is_the_sum_over_points():
     np.testing.assert_allclose(result, expected, rtol=1e-12)
 
 
+def test_further_bounces_are_the_sums_over_all_paths():
+    """Of light, point after point, each to the next; pixels sum over the points."""
+    t = jax.tree.map(np.asarray, TRANSFER)
+    emitted = np.array(
+        [t.diffuse[j] * irradiance(SPOT, t.position[j], t.normal[j]) for j in range(POINTS)]
+    )
+    matrix, paths, expected = np.asarray(t.exchange), emitted, emitted
+    for bounces in (1, 2, 3):
+        if bounces > 1:
+            after = np.zeros_like(paths)
+            for to, start in np.ndindex(POINTS, POINTS):
+                after[to] += t.diffuse[to] * matrix[to, start] * paths[start]
+            paths, expected = after, expected + after
+        image = IMAGE * (SHADER >= 0)[..., None] * (t.receive @ (t.send @ expected))
+        found = relight.indirect(CACHE, TRANSFER, [SPOT], bounces=bounces)
+        np.testing.assert_allclose(found, image, rtol=1e-12)
+
+
+def test_both_modes_match_differences_through_two_bounces():
+    """In the pixels' and points' reflectance, the exchange, and the light."""
+
+    def loss(diffuse, reflectance, exchange, position):
+        cache = eqx.tree_at(lambda g: g.diffuse, CACHE, diffuse)
+        fields = vars(TRANSFER) | {"diffuse": reflectance, "exchange": exchange}
+        light = PointLight(position, [2, 1, 4.0])
+        return jnp.sum(relight.indirect(cache, Transfer(**fields), [light], bounces=2) ** 2)
+
+    at = CACHE.diffuse, TRANSFER.diffuse, TRANSFER.exchange, jnp.asarray([0.5, 2, -1.0])
+    check_slopes(loss, at)
+
+
 def test_no_lights_and_ambient_ones_bring_nothing():
     for lights in ([], LIGHTS[:1]):
         assert not np.asarray(relight.indirect(CACHE, TRANSFER, lights)).any()
@@ -104,8 +139,11 @@ def test_a_bad_pixel_stays_where_it_is():
 def test_errors_name_the_argument():
     indirect = inspect.unwrap(relight.indirect)
     small = Transfer(*(v[:2] if i == 0 else v for i, v in enumerate(vars(TRANSFER).values())))
+    once = Transfer(**vars(TRANSFER) | {"exchange": None})
     for arguments, options, message in (
         ((CACHE, small, LIGHTS), {}, r"`indirect\(transfer\)` must be of the cache's height"),
+        ((CACHE, TRANSFER, [SPOT]), {"bounces": 0}, r"`indirect\(bounces=...\)` must be"),
+        ((CACHE, once, [SPOT]), {"bounces": 2}, r"`indirect\(bounces=...\)` must be 1 for a"),
         ((CACHE, TRANSFER, SPOT), {}, r"`indirect\(lights\)` must be a sequence of lights"),
         ((CACHE, TRANSFER, [1]), {}, r"`indirect\(lights\[0\]\)` must be one of Ambient"),
         (

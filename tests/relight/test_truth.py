@@ -55,16 +55,28 @@ def test_direct_light_with_shadows_is_the_path_tracers_to_rounding(stage):
 
 
 @pytest.mark.full
-def test_a_bounce_is_the_path_tracers_but_for_the_noise_of_both():
+@pytest.mark.parametrize("bounces", [1, 2])
+def test_bounces_are_the_path_tracers_but_for_the_noise_of_both(bounces):
     size = (24, 32)
     mesh = scene.still_life()
     camera = scene.default_camera(mesh, height=size[0], width=size[1])
     gbuffer, light = truth.lambert(mesh, camera, size), truth.LIGHTS["directional"]
     transfer = scene.transfer(mesh, gbuffer, camera, point_count=512, rank=64)
     lit = truth.unshadowed(mesh, np.asarray(transfer.position, float), light)
-    image = np.asarray(relight.indirect(gbuffer, transfer, [light], visibilities=[lit]))
-    expected, noise = truth.bounced(mesh, camera, light, size, 128)
+    find = lambda n: np.asarray(
+        relight.indirect(gbuffer, transfer, [light], visibilities=[lit], bounces=n)
+    )
+    image = find(bounces)
+    expected, noise = truth.bounced(mesh, camera, light, size, 128, bounces=bounces)
     error, size = (np.sqrt(np.mean(v**2)) for v in (image - expected, expected))
+    print(
+        bounces,
+        image.mean(),
+        find(1).mean(),
+        expected.mean(),
+        error / size,
+        np.sqrt(np.mean(noise**2)) / size,
+    )
     assert np.sqrt(np.mean(noise**2)) < 0.2 * size
     assert error < 0.4 * size
     assert image.mean() == pytest.approx(expected.mean(), rel=0.12)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from trimesh import Trimesh, creation, util
 
-from jaxfx import OrthographicCamera, PinholeCamera, scene
+from jaxfx import OrthographicCamera, PinholeCamera, SphericalHarmonicsLight, relight, scene
 
 
 pytestmark = pytest.mark.skipif(
@@ -53,6 +53,34 @@ def test_an_enclosure_gets_what_it_sends(ball):
     np.testing.assert_allclose(np.asarray(ball.position) ** 2 @ np.ones(3), 4, rtol=0.02)
     uneven = 1 + np.asarray(ball.normal) @ [0.3, -0.5, 0.4]
     np.testing.assert_allclose(shares @ uneven, 1, atol=0.05)
+
+
+def test_the_points_of_an_enclosure_exchange_all():
+    """In a furnace of reflectance r the irradiance after n bounces is r + r**2 + ... + r**n."""
+    inside = creation.icosphere(2, radius=2.0)
+    inside.invert()
+    camera = PinholeCamera.from_fov(1.5, height=4, width=4)
+    _, gbuffer, transfer = built([inside], camera, (4, 4), point_count=300, rank=300)
+    exchange = np.asarray(transfer.exchange)
+    assert exchange.sum(axis=1).mean() == pytest.approx(1, abs=0.04)
+    np.testing.assert_allclose(exchange.sum(axis=1), 1, atol=0.08)
+    even = SphericalHarmonicsLight(np.pad([[1.0, 1, 1]], ((0, 8), (0, 0))))
+    once, twice, thrice = (
+        np.asarray(relight.indirect(gbuffer, transfer, [even], bounces=n)) for n in (1, 2, 3)
+    )
+    r = float(gbuffer.diffuse[0, 0, 0])
+    np.testing.assert_allclose(twice / once, 1 + r, rtol=0.04)
+    np.testing.assert_allclose(thrice / once, 1 + r + r**2, rtol=0.04)
+
+
+def test_facing_squares_send_light_back_by_their_form_factor():
+    """Hottel's 0.19982 of it, point by point; none to points of the same square."""
+    transfer = built([square(0, 1), square(1, -1)], middle(), point_count=256, rank=4)[2]
+    exchange, low = np.asarray(transfer.exchange), np.asarray(transfer.position)[:, 2] < 0.5
+    np.testing.assert_array_equal(exchange[np.ix_(low, low)], 0)
+    back = exchange[np.ix_(~low, low)].sum(axis=1)
+    # The lower points are spread evenly; the upper ones lie denser where they send more.
+    assert back.mean() == pytest.approx(0.19982, rel=0.05)
 
 
 @pytest.mark.full
