@@ -168,43 +168,10 @@ def surroundings(path: str) -> EnvironmentLight:
 
 def panorama(path: str) -> np.ndarray:
     """A picture of all directions, linear; negative numbers, from a resampling say, are 0."""
-    if Path(path).suffix.lower() == ".hdr":
-        picture = radiance(Path(path).read_bytes(), path)
-    else:
-        picture = io.read_color(path)
+    picture = io.read_color(path)
     if picture.shape[2] < 3:  # Gray, and perhaps its alpha.
         picture = np.repeat(picture[..., :1], 3, axis=2)
     return np.maximum(picture[..., :3], 0)
-
-
-def radiance(data: bytes, path: str) -> np.ndarray:
-    """The picture in a Radiance file of the usual kind: rows from the top, run-length coded."""
-    header, mark, body = data.partition(b"\n\n")
-    size, newline, body = body.partition(b"\n")
-    words = size.split()
-    if not (header.startswith(b"#?") and mark and newline and len(words) == 4):
-        raise ValueError(f"{path!r} is no Radiance picture.")
-    if words[0] != b"-Y" or words[2] != b"+X" or b"rgbe" not in header:
-        raise ValueError(f"{path!r} must be of -Y +X rgbe, got {size.decode('latin-1')!r}.")
-    height, width = int(words[1]), int(words[3])
-    texels, at = np.zeros((height, 4, width), np.uint8), 0
-    try:
-        for row in texels:
-            if body[at : at + 4] != bytes([2, 2, width >> 8, width & 255]):
-                raise ValueError(f"{path!r} must be run-length coded by channels.")
-            at += 4
-            for channel in row:
-                done = 0
-                while done < width:
-                    count, at = body[at], at + 1
-                    is_run, count = count > 128, count - 128 * (count > 128)
-                    used = 1 if is_run else count
-                    channel[done : done + count] = np.frombuffer(body, np.uint8, used, at)
-                    done, at = done + count, at + used
-    except IndexError:
-        raise ValueError(f"{path!r} ends early.") from None
-    scale = np.ldexp(1.0, texels[:, 3].astype(int) - 136)
-    return np.moveaxis(texels[:, :3] * scale[:, None], 1, -1)
 
 
 def sky() -> np.ndarray:
