@@ -88,9 +88,9 @@ def layered(
     - `margin`: static; pixels. By so much the images that are given are larger on each side
       than what is returned: what is known beyond the frame is not guessed.
 
-    **Returns:** height width channel, without the margin, in the type of `image`. A pixel whose colour is not a
-    number spoils what its sprite can reach. One whose depth is missing has no sprite: it shows
-    what reaches it or, where nothing does, its own colour.
+    **Returns:** height width channel, without the margin, in the type of `image`. A pixel whose
+    colour is not a number spoils what its sprite can reach. One whose depth is missing has no
+    sprite: it shows what reaches it or, where nothing does, its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
     `threshold`, alpha outside [0, 1], an `iris` or a layer that is none, an unknown `pad`, a
@@ -126,9 +126,9 @@ def layered(
     Slices are painted row by row of each disc. The time, also that of the gradient, grows with
     the radius.
 
-    With a second layer its sprites fill what the first leaves, and so on. A point of it counts where the
-    lens sees past the first layer: in 8 directions the first layer is followed from the pixel
-    as long as it lies in front of the point, which gives the part of the lens that it covers.
+    With a second layer its sprites fill what the first leaves, and so on. A point of it counts
+    where the lens sees past the first layer: in 8 directions that is followed from the pixel as
+    long as it lies in front of the point, which gives the part of the lens that it covers.
     A point less than one slice behind is taken to be of the surface that hides it, and one of
     two slices or more behind to be of another surface. In between the share rises linearly.
     Behind several layers a point must be seen past each. A sprite covers alpha times what it
@@ -140,12 +140,12 @@ def layered(
 
     Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
     the frame. Through which part of the lens a soft matte lets light is not known: where both
-    it and what is behind it are blurred, colours are off by up to 0.05 at a circle of 12
-    pixels. Nothing is guessed behind a pixel whose alpha is below 1. Within a slice nothing hides anything. The
-    parts of the lens that two edges hide are added up, even where they overlap. How much of the
-    lens sees a point of the second layer is that of a disc, whatever the iris. With an iris and
-    float32, a highlight of a hundred million times its surroundings changes them by 2 % along
-    its rows, one of 5000 times by a millionth or two.
+    it and what is behind it are blurred, colours are off by up to 0.05 at circles of 12 pixels.
+    Nothing is guessed behind a pixel whose alpha is below 1. Within a slice nothing hides
+    anything. The parts of the lens that two edges hide are added up, even where they overlap.
+    How much of the lens sees a point of a layer behind is that of a disc, whatever the iris.
+    With an iris and float32, a highlight of a hundred million times its surroundings changes
+    them by 2 % along its rows, one of 5000 times by a millionth or two.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is

@@ -5,6 +5,7 @@ half of d times the point, which is exact for planes that face the camera.
 """
 
 import inspect
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,11 +133,11 @@ def test_alpha_of_one_everywhere_is_none():
 SMALL = 7, 9
 
 
-def small(seed=0):
+def small(seed=0) -> tuple:
     rng = np.random.default_rng(seed)
     alpha = rng.uniform(0.2, 0.9, SMALL)
     alpha[2, 2:5], alpha[4, 2:5] = 0, 1
-    behind = [(rng.random((*SMALL, 3)), rng.uniform(4, 6, SMALL)) for _ in range(2)]
+    behind: Any = [(rng.random((*SMALL, 3)), rng.uniform(4, 6, SMALL)) for _ in range(2)]
     return rng.random((*SMALL, 3)), rng.uniform(1.2, 3, SMALL), behind, alpha
 
 
