@@ -193,10 +193,6 @@ EXAMPLES = {
         lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size)),
         "peel",
         None,
-        lambda rng, size: [
-            (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 6, size)),
-            (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(6, 8, size), rng.uniform(0, 1, size)),
-        ],
     ],
     "disparity": [lambda rng, size: rng.uniform(1.1, 4, size)],
     "distance": [lambda rng, size: rng.uniform(1.1, 4, size)],
@@ -213,7 +209,6 @@ EXAMPLES = {
 # Examples of functions that take fewer types than others of that name.
 OWN_EXAMPLES = {
     ("dof.layered", "alpha"): [None, lambda rng, size: rng.uniform(0.1, 0.9, size)],
-    ("dof.layered", "margin"): [0, 2],
     ("dof.peel", "behind"): [
         None,
         lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size)),

@@ -2,11 +2,9 @@
 
 import functools as ft
 import math
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
@@ -15,7 +13,6 @@ from jaxfx._checks import (
     WholeNumber,
     check,
     is_concrete,
-    option,
     parameter,
     share,
     whole_number,
@@ -52,7 +49,6 @@ def layered(
     alpha: Num[ArrayLike, "height width"] | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
     iris: Iris | None = None,
-    pad: Literal["edge", "reflect"] = "edge",
     margin: WholeNumber = 0,
 ) -> Float[Array, "rows columns channel"]:
     """Depth of field with occlusion: point sprites composited per pixel from front to back.
@@ -83,18 +79,16 @@ def layered(
       serves all scenes that were tried. Values below `max_coc / 128` are raised to that.
     - `iris`: the shape of the sprites; by default the disc. The program is then another one,
       the same on every device, and slower.
-    - `pad`: how the layers go on beyond the frame: `"edge"` repeats the last pixels,
-      `"reflect"` mirrors the image, the last pixel included.
     - `margin`: static; pixels. By so much the images that are given are larger on each side
-      than what is returned: what is known beyond the frame is not guessed.
+      than what is returned, so that nothing has to be guessed there.
 
     **Returns:** height width channel, without the margin, in the type of `image`. A pixel whose
     colour is not a number spoils what its sprite can reach. One whose depth is missing has no
     sprite: it shows what reaches it or, where nothing does, its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
-    `threshold`, alpha outside [0, 1], an `iris` or a layer that is none, an unknown `pad`, a
-    `margin` that leaves nothing, or no `max_coc` under a transform.
+    `threshold`, alpha outside [0, 1], an `iris` or a layer that is none, a `margin`
+    that leaves nothing, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `alpha` (at 0 and 1 too), all of
     `behind`, `threshold` and every field of `lens` and `iris`, forward and reverse; of a
@@ -138,14 +132,15 @@ def layered(
     A guessed second layer repeats pixels from next to an edge. On 18 images of three scenes,
     those that `peel` was made on, it gains 1.05 dB on average and loses nothing.
 
-    Known limits: what no layer shows is guessed from its surroundings, as is what lies beyond
-    the frame. Through which part of the lens a soft matte lets light is not known: where both
-    it and what is behind it are blurred, colours are off by up to 0.05 at circles of 12 pixels.
-    Nothing is guessed behind a pixel whose alpha is below 1. Within a slice nothing hides
-    anything. The parts of the lens that two edges hide are added up, even where they overlap.
-    How much of the lens sees a point of a layer behind is that of a disc, whatever the iris.
-    With an iris and float32, a highlight of a hundred million times its surroundings changes
-    them by 2 % along its rows, one of 5000 times by a millionth or two.
+    Known limits: what no layer shows is guessed from its surroundings; beyond the frame the
+    last pixels are repeated, so that the border is some 3 dB worse than the inside. Through
+    which part of the lens a soft matte lets light is not known: where both it and what is
+    behind it are blurred by 12 pixels, colours are off by up to 0.05 in a test. Nothing is
+    guessed behind a pixel whose alpha is below 1. Within a slice nothing hides anything. The
+    parts of the lens that two edges hide are added up, even where they overlap. How much of
+    the lens sees a point of a layer behind is that of a disc, whatever the iris. With an iris
+    and float32, a highlight of a hundred million times its surroundings changes them by 2 %
+    along its rows, one of 5000 times by a millionth or two.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is
@@ -155,7 +150,6 @@ def layered(
     image, depth, lens, max_coc = check_arguments("layered", image, depth, own, max_coc)
     threshold = parameter("layered(threshold=...)", threshold)
     check("layered(threshold=...)", threshold, lambda v: v >= 0, "0 or positive")
-    option("layered(pad=...)", pad, ("edge", "reflect"))
     least = min(depth.shape)
     is_inside = lambda n: n >= 0 and 2 * n < least
     margin = whole_number(
@@ -184,12 +178,12 @@ def layered(
     if iris is not None:
         iris = check_iris("layered(iris=...)", iris)
     return _layered(
-        Layer(image, depth, lens, alpha), extent, tuple(layers), threshold, iris, pad, margin
+        Layer(image, depth, lens, alpha), extent, tuple(layers), threshold, iris, margin
     )
 
 
-@ft.partial(jax.jit, static_argnames=("extent", "pad", "margin"))
-def _layered(first, extent, behind, threshold, iris, pad, margin):
+@ft.partial(jax.jit, static_argnames=("extent", "margin"))
+def _layered(first, extent, behind, threshold, iris, margin):
     max_coc = extent.max_coc
     view, alpha = _seen_alone(first, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
@@ -215,11 +209,8 @@ def _layered(first, extent, behind, threshold, iris, pad, margin):
         layers.append(_sheet(hidden.image, farther, through, *options))
         spoils |= spoiled(hidden.bad, jnp.abs(hidden.defocus), max_coc)
         surfaces.append(Surface(farther, is_there, alpha_behind))
-    beyond = extent.reach - margin
-    framed = lambda x: _framed(x, beyond, pad)
+    framed = lambda x: _framed(x, extent.reach - margin)
     sheets = jax.tree.map(lambda *planes: jnp.stack([framed(x) for x in planes]), *layers)
-    if pad == "reflect":
-        sheets = _turned(sheets, beyond)
     if iris is None:
         sums = composited(extent, sheets)
     else:
@@ -263,22 +254,11 @@ def _inside(x: Array, margin: int) -> Array:
     return x[margin : x.shape[0] - margin, margin : x.shape[1] - margin]
 
 
-def _framed(x: Float[Array, "*plane height width"], beyond: int, pad: str) -> Array:
-    """A plane that goes on `beyond` pixels outside; or ends inside, where it is negative."""
+def _framed(x: Float[Array, "*plane height width"], beyond: int) -> Array:
+    """A plane with its last pixels repeated, `beyond` times; cut off where it is negative."""
     if beyond < 0:
         return x[..., -beyond:beyond, -beyond:beyond]
-    mode = {"edge": "edge", "reflect": "symmetric"}[pad]
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(beyond, beyond)] * 2, mode=mode)
-
-
-def _turned(sheets: Sheets, beyond: int) -> Sheets:
-    """Sheets with slopes turned round where a plane is its mirror image."""
-    if beyond <= 0:
-        return sheets
-    height, width = (n - 2 * beyond for n in sheets.radius.shape[-2:])
-    way = lambda n: np.where(np.arange(-beyond, n + beyond) // n % 2, -1, 1)
-    ways = np.stack(np.broadcast_arrays(way(width)[None], way(height)[:, None]))
-    return sheets._replace(tilt=sheets.tilt * ways[None].astype(sheets.tilt.dtype))
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(beyond, beyond)] * 2, mode="edge")
 
 
 def _sheet(

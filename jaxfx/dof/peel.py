@@ -112,7 +112,7 @@ class Sources(NamedTuple):
 
 @ft.partial(jax.jit, static_argnames=("max_coc",))
 def _peel(layers, max_coc, threshold):
-    views = [defocused(*layer[:3], max_coc) for layer in layers]
+    views = [defocused(x.image, x.depth, x.lens, max_coc) for x in layers]
     defocus = jax.lax.stop_gradient(views[0].defocus)
     threshold = jax.lax.stop_gradient(threshold).astype(defocus.dtype)
     # In front of what is sought lies the last layer that a pixel has.

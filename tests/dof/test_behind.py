@@ -1,4 +1,4 @@
-"""Several layers, alpha, and what lies beyond the frame, against passes through a lens.
+"""Several layers, alpha, and a margin, against passes through a lens.
 
 The reference composites planes for each point of the lens: a plane of defocus d is moved by
 half of d times the point, which is exact for planes that face the camera.
@@ -177,32 +177,17 @@ def test_derivatives_of_all_layers_and_of_alpha_are_the_difference_quotient():
 
 
 @pytest.mark.parametrize("margin", [1, 9])
-@pytest.mark.parametrize("pad", ["edge", "reflect"])
-def test_a_margin_is_left_out_of_the_output(pad, margin):
+def test_a_margin_is_left_out_of_the_output(margin):
     """Smaller than the largest sprite, and larger."""
     image, depth, behind, alpha = small(2)
     tall = lambda x: np.repeat(np.repeat(x, 3, axis=0), 3, axis=1)
     image, depth, alpha = map(tall, (image, depth, alpha))
-    behind = [tuple(map(tall, layer)) for layer in behind]
+    behind: Any = [tuple(map(tall, layer)) for layer in behind]
     blur = lambda **more: dof.layered(
-        image, depth, LENS, max_coc=8.0, behind=behind, alpha=alpha, pad=pad, **more
+        image, depth, LENS, max_coc=8.0, behind=behind, alpha=alpha, **more
     )
     inside = blur()[margin:-margin, margin:-margin]
     assert np.abs(blur(margin=margin) - inside).max() < 1e-9
-
-
-def test_a_mirrored_frame_is_that_of_a_larger_image():
-    """Also where the mirror image is mirrored again: sprites reach farther than the image."""
-    depth = np.pad(np.random.default_rng(3).choice([1.0, 2.0, 4.0], (2, 3)), 2, mode="edge")
-    image = texture(3, depth.shape)
-    wider = lambda x: np.pad(x, [(9, 9), (9, 9)] + [(0, 0)] * (x.ndim - 2), mode="symmetric")
-    blur = lambda image, depth, **more: dof.layered(
-        image, depth, LENS, max_coc=12.0, behind=None, **more
-    )
-    exact = blur(wider(image), wider(depth), margin=9)
-    mirrored = blur(image, depth, pad="reflect")
-    assert np.abs(mirrored - exact).max() < 1e-9
-    assert np.abs(blur(image, depth) - exact).max() > 0.01
 
 
 def test_faults_are_named():
@@ -216,8 +201,6 @@ def test_faults_are_named():
         layered(image, depth, LENS, alpha=2 * depth)
     with pytest.raises(ValueError, match=r"`layered\(alpha=...\)` must have shape"):
         layered(image, depth, LENS, alpha=depth[1:])
-    with pytest.raises(ValueError, match=r"`layered\(pad=...\)` must be one of"):
-        layered(image, depth, LENS, pad="wrap")
     for margin in (-1, 12, 0.5):
         with pytest.raises(ValueError, match=r"`layered\(margin=...\)` must be an integer"):
             layered(image, depth, LENS, margin=margin)
