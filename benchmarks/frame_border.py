@@ -8,7 +8,9 @@ layer is used, and a guessed one behind it.
 """
 
 import argparse
+import functools as ft
 import itertools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,16 +37,18 @@ def rows(case):
         def score(picture, mask, truth=truth):
             return float(metrics.psnr(picture, truth, mask=jnp.asarray(mask)))
 
-        small, large = (cut(case.image), cut(case.depth)), (case.image, case.depth)
-        room = {"max_coc": largest + 0.01}
-        edge = dof.layered(*small, lens, **room)
-        mirror = lambda x: jnp.pad(
-            x, [(MARGIN, MARGIN)] * 2 + [(0, 0)] * (x.ndim - 2), mode="symmetric"
-        )
-        mirrored = dof.layered(*map(mirror, small), lens, margin=MARGIN, **room)
-        wide = dof.layered(*large, lens, margin=MARGIN, **room)
+        blur = ft.partial(dof.layered, lens=lens, max_coc=largest + 0.01)
+        image, depth = cut(case.image), cut(case.depth)
+        edge = blur(image, depth)
+        mirrored = blur(_mirrored(image), _mirrored(depth), margin=MARGIN)
+        wide = blur(case.image, case.depth, margin=MARGIN)
         found = [score(picture, border) for picture in (edge, mirrored, wide)]
         yield name, largest, np.array([*found, score(edge, ~border)])
+
+
+def _mirrored(x):
+    """With its mirror image, the last pixel included, by the margin on each side."""
+    return jnp.pad(x, [(MARGIN, MARGIN)] * 2 + [(0, 0)] * (x.ndim - 2), mode="symmetric")
 
 
 def main():
@@ -54,7 +58,7 @@ def main():
     parser.add_argument("--samples", type=int, default=64, help="passes of a reference")
     given = parser.parse_args()
     size, samples = (given.side + 2 * MARGIN,) * 2, given.samples
-    cases = {"still life": lambda: Case(scene.still_life(), size, samples)}
+    cases: dict[str, Any] = {"still life": lambda: Case(scene.still_life(), size, samples)}
     for path in given.meshes:
         title = path.rpartition("/")[2]
         cases[title] = lambda path=path: Case(scene.load(path), size, samples)

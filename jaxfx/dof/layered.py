@@ -188,8 +188,8 @@ def _layered(first, extent, behind, threshold, iris, margin):
     view, alpha = _seen_alone(first, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
     area = math.pi if iris is None else iris.area().astype(view.image.dtype)
-    through = jnp.where(view.missing, 0, 1 if alpha is None else _painted(alpha))
-    through = jnp.broadcast_to(through, view.defocus.shape).astype(view.defocus.dtype)
+    opaque = jnp.ones_like(view.defocus) if alpha is None else _painted(alpha)
+    through = jnp.where(view.missing, 0, opaque)
     layers = [_sheet(view.image, view.defocus, through, view.missing, threshold, area, alpha)]
     spoils = spoiled(view.bad, jnp.abs(view.defocus), max_coc) | view.lost
     # Behind a missing pixel no layer is known to be seen, but where it is clear.

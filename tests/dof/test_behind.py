@@ -15,6 +15,7 @@ import pytest
 from jaxfx import ThinLens, dof
 from jaxfx.dof.accumulate import lens_samples
 from tests.dof.test_layered import FAR, FOCUS, LENS, NEAR, SIZE, texture
+from tests.helpers.programs import for_accelerators
 
 
 # Depths at which LENS has a defocus of -4 and -6 pixels.
@@ -174,6 +175,15 @@ def test_derivatives_of_all_layers_and_of_alpha_are_the_difference_quotient():
     quotient = (4 * moved(1) - 3 * moved(0) - moved(2)) / (2 * step)
     assert abs(forward - reverse) < 1e-9 * abs(forward)
     assert abs(forward - quotient) < 1e-4 * abs(quotient)
+
+
+def test_the_program_for_accelerators_has_the_same_values():
+    image, depth, behind, alpha = small(4)
+    blur = lambda: dof.layered(image, depth, LENS, max_coc=6.0, behind=behind, alpha=alpha)
+    expected = blur()
+    with for_accelerators():
+        found = jax.jit(lambda: blur())()
+    assert np.abs(found - expected).max() < 1e-9
 
 
 @pytest.mark.parametrize("margin", [1, 9])
