@@ -15,7 +15,6 @@ import pytest
 from jaxfx import ThinLens, dof
 from jaxfx.dof.accumulate import lens_samples
 from tests.dof.test_layered import FAR, FOCUS, LENS, NEAR, SIZE, texture
-from tests.helpers.programs import for_accelerators
 
 
 # Depths at which LENS has a defocus of -4 and -6 pixels.
@@ -101,6 +100,7 @@ def test_alpha_in_focus_is_plain_over(lens):
         *[(HALF, 4.0, 0.02), (NEAR, 4.0, 0.03), (HALF, FAR, 0.04), (NEAR, FAR, 0.06)],
     ],
 )
+@pytest.mark.full
 def test_a_soft_matte_is_what_passes_show(near, far, most):
     """A matte that fades over 16 pixels, before a wall; either may be in focus."""
     front, wall = waves(4), waves(5)
@@ -113,6 +113,7 @@ def test_a_soft_matte_is_what_passes_show(near, far, most):
     assert np.abs(out[12] - exact)[8:-8].max() < most
 
 
+@pytest.mark.full
 def test_clear_pixels_may_hold_anything():
     """Neither their colour nor their depth counts."""
     front, wall, matte = waves(6), wide(waves(7)), wide(np.clip((40 - COLUMN) / 8, 0, 1))
@@ -124,6 +125,7 @@ def test_clear_pixels_may_hold_anything():
     assert np.abs(clear[:, 50:] - wall[:, 50:]).max() < 1e-9
 
 
+@pytest.mark.full
 def test_alpha_of_one_everywhere_is_none():
     image, depth, wall = texture(8), np.random.default_rng(8).uniform(1, 5, SIZE), texture(9)
     behind = wall, depth + 2
@@ -159,6 +161,7 @@ def derivatives(image, depth, behind, alpha, dot):
     )
 
 
+@pytest.mark.full
 def test_derivatives_of_all_layers_and_of_alpha_are_the_difference_quotient():
     data = jax.tree.map(jnp.asarray, small())
     rng = np.random.default_rng(1)
@@ -177,16 +180,8 @@ def test_derivatives_of_all_layers_and_of_alpha_are_the_difference_quotient():
     assert abs(forward - quotient) < 1e-4 * abs(quotient)
 
 
-def test_the_program_for_accelerators_has_the_same_values():
-    image, depth, behind, alpha = small(4)
-    blur = lambda: dof.layered(image, depth, LENS, max_coc=6.0, behind=behind, alpha=alpha)
-    expected = blur()
-    with for_accelerators():
-        found = jax.jit(lambda: blur())()
-    assert np.abs(found - expected).max() < 1e-9
-
-
 @pytest.mark.parametrize("margin", [1, 9])
+@pytest.mark.full
 def test_a_margin_is_left_out_of_the_output(margin):
     """Smaller than the largest sprite, and larger."""
     image, depth, behind, alpha = small(2)
