@@ -2,7 +2,8 @@
 
 `python -m benchmarks.hidden_layers [MESH ...]` prints a row for each of three foci and two
 apertures of every scene: the PSNR of one layer to the multi-pass reference, and how much more
-two have, of which the second is guessed by `dof.peel` or true. The scenes are the still life,
+two have, of which the second is guessed by `dof.peel` or true, and three, of which the second
+is true and what lies behind both is guessed. The scenes are the still life,
 the meshes that are given, and two rooms of boxes, on which nothing was chosen: one with eight
 boxes, one behind a fence.
 """
@@ -71,16 +72,17 @@ def fenced(seed):
 
 
 def rows(case):
-    """A focus, a largest circle, and the figures of one layer, a guessed and a true second."""
+    """A focus, a largest circle; one layer, a guessed second, a true one, that and a guess."""
     for (name, share), largest in itertools.product(FOCI.items(), LARGEST):
         lens, truth = case.focused(share, largest)
         data, room = (case.image, case.depth, lens), largest + 0.01
         score = lambda truth=truth, data=data, room=room, **options: float(
             metrics.psnr(dof.layered(*data, max_coc=room, **options), truth)
         )
-        true = np.nan if case.behind is None else score(behind=case.behind)
-        guess = dof.peel(*data, max_coc=room)
-        yield name, largest, np.array([score(behind=None), score(behind=guess), true])
+        true = three = np.nan
+        if case.behind is not None:
+            true, three = score(behind=case.behind), score(behind=[case.behind, "peel"])
+        yield name, largest, np.array([score(behind=None), score(behind="peel"), true, three])
 
 
 def main():
@@ -98,20 +100,17 @@ def main():
         cases[title] = lambda path=path: Case(scene.load(path), size, given.samples)
     cases["room"] = lambda: RoomCase(rooms.room(11, boxes=8), size, given.samples)
     cases["fence"] = lambda: RoomCase(fenced(12), size, given.samples)
-    print("| scene | focus | CoC | one layer | guessed second | true second |")
-    print("|---|---|---:|---:|---:|---:|")
+    print("| scene | focus | CoC | one layer | guessed second | true second | and a guess |")
+    print("|---|---|---:|---:|---:|---:|---:|")
     for title, case in cases.items():
         gains = []
         for name, largest, figures in rows(case()):
             gains.append(figures[1:] - figures[0])
-            print(
-                f"| {title} | {name} | {largest} | {figures[0]:.2f} | "
-                f"{gains[-1][0]:+.2f} | {gains[-1][1]:+.2f} |".replace("+nan", ""),
-                flush=True,
-            )
-        mean, least = np.mean(gains, axis=0), np.min(gains, axis=0)
-        line = f"| {title} | mean, least | | | {mean[0]:+.2f}, {least[0]:+.2f} | "
-        print(line + f"{mean[1]:+.2f}, {least[1]:+.2f} |".replace("+nan, +nan", ""), flush=True)
+            cells = "".join(f" {gain:+.2f} |" for gain in gains[-1]).replace("+nan", "")
+            print(f"| {title} | {name} | {largest} | {figures[0]:.2f} |{cells}", flush=True)
+        pairs = zip(np.mean(gains, axis=0), np.min(gains, axis=0), strict=True)
+        cells = "".join(f" {mean:+.2f}, {least:+.2f} |" for mean, least in pairs)
+        print(f"| {title} | mean, least | | |{cells}".replace("+nan, +nan", ""), flush=True)
 
 
 if __name__ == "__main__":

@@ -212,6 +212,11 @@ EXAMPLES = {
 
 # Examples of functions that take fewer types than others of that name.
 OWN_EXAMPLES = {
+    ("dof.layered", "alpha"): [None, lambda rng, size: rng.uniform(0.1, 0.9, size)],
+    ("dof.peel", "behind"): [
+        None,
+        lambda rng, size: (rng.uniform(0.1, 1, (*size, 3)), rng.uniform(4.1, 8, size)),
+    ],
     ("reproject.warp", "camera"): [turned],
     ("reproject.blend", "cameras"): [lambda rng, size: [turned(rng, size) for _ in range(2)]],
     ("reproject.choose", "cameras"): [lambda rng, size: [turned(rng, size) for _ in range(2)]],

@@ -16,6 +16,10 @@ from tests.dof.kernels.test_layers import (
     in_plain_numpy,
     random_sheets,
 )
+from tests.dof.test_behind import (  # noqa: F401
+    test_a_third_layer_shows_past_the_second,
+    test_clear_pixels_may_hold_anything,
+)
 from tests.dof.test_diffusion import (  # noqa: F401
     test_a_point_of_light_has_the_variance_of_its_disc,
     test_energy_is_kept_and_nothing_rings,
