@@ -20,6 +20,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxfx import PinholeCamera, ThinLens, blur, dof, reproject, shadow, sharding
 from tests.helpers import quick
+from tests.helpers.fits import FITS
 from tests.test_transforms import CASES
 
 
@@ -71,12 +72,22 @@ def stacked(name, size):
 
 
 def batch(name, mesh, gradient=True, size=(9, 7), shape=(DEVICES,), names=("batch",)):
-    """A batch of a case over eight devices against one device.
+    """A batch of a case over eight devices against one device."""
+    call, with_gradient, batch = stacked(name, size)
+    return divided(jax.vmap(with_gradient if gradient else call), batch, mesh, shape, names)
+
+
+def fits(name, mesh):
+    """A fit of each of eight frames or starts, over eight devices against one device."""
+    fitted, data = FITS[name](DEVICES)
+    return divided(jax.vmap(lambda data: fitted(*data)), data, mesh)
+
+
+def divided(mapped, batch, mesh, shape=(DEVICES,), names=("batch",)):
+    """A function of a batch over eight devices against one device.
 
     `mesh` is "explicit" or "auto", for `jit(vmap(f))`, or "shard_map".
     """
-    call, with_gradient, batch = stacked(name, size)
-    mapped = jax.vmap(with_gradient if gradient else call)
     expected = jax.jit(mapped)(batch)
     devices, spec = mesh_of(mesh, shape, names), PartitionSpec(names[0])
     placed = jax.device_put(batch, NamedSharding(devices, spec))
@@ -225,6 +236,7 @@ CHECKS = {
     "page": page,
     "memory": memory,
     "batch": batch,
+    "fits": fits,
     "rows": rows,
     "target_rows": target_rows,
 }
