@@ -39,6 +39,11 @@ def fitted_under_transform(
                 f"`{function}({name}=...)` must be False under `jit` and `vmap`, where a "
                 f"search can neither raise nor print, got {value!r}."
             )
+    if jax.sharding.get_abstract_mesh().manual_axes:  # The loops of a solver are not ours.
+        raise ValueError(
+            f"`{function}` can't search inside `jax.shard_map`, of which its solver knows "
+            "nothing: `jit(vmap(...))` of a sharded batch searches where each member lies."
+        )
     arrays, static = eqx.partition(data, eqx.is_array)
     of_arrays = one_by_one_on_cpu(lambda arrays: fit(eqx.combine(arrays, static)))
     return on_any_mesh(of_arrays)(arrays)

@@ -91,7 +91,7 @@ def lights(count):
         photograph = functools.reduce(
             jnp.add, [relight.shade(gbuffer, CAMERA, light) for light in seen]
         )
-        return fit.lights(photograph, gbuffer, CAMERA, start, max_steps=4, throw=False)
+        return fit.lights(photograph, gbuffer, CAMERA, start, max_steps=12, throw=False)
 
     return fitted, (
         rng.uniform(1, 3, (count, 3)),
