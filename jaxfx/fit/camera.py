@@ -152,7 +152,9 @@ def camera(
     or a depth that is nowhere known. `RuntimeError` where the fit is no success and `throw` is
     true.
 
-    **Gradient:** none through the search: it stops at every step to report.
+    **Gradient:** none through the search: it stops at every step to report. Under `jit` and
+    `vmap` it is a part of the program, of a batch one after the other on the device where each
+    member lies; `throw` and `progress` must then be false. NaN fills up `losses`.
 
     **Example:** an image is registered to itself.
 

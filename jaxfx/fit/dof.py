@@ -205,7 +205,11 @@ def dof(
     confusion below a pixel or above `max_coc`), or an image that is not finite.
     `RuntimeError` where the fit is no success and `throw` is true.
 
-    **Gradient:** none through the search: it stops at every step to report.
+    **Gradient:** none through the search: it stops at every step to report. Under `jit` and
+    `vmap` it is a part of the program, of a batch one after the other on the device where each
+    member lies; `throw` and `progress` must then be false, and `max_coc` be given.
+    For it the images of the first searches are smaller by a factor that follows from
+    `max_coc`, and NaN fills up `losses`.
 
     **Example:** the aperture of a blurred image.
 

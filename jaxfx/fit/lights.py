@@ -178,7 +178,10 @@ def lights(
     that differ, parameters that no light has, a reference that is not finite, or a start where
     nothing changes the image. `RuntimeError` where the fit is no success and `throw` is true.
 
-    **Gradient:** none through the search: it stops at every step to report.
+    **Gradient:** none through the search: it stops at every step to report. Under `jit` and
+    `vmap` it is a part of the program, of a batch one after the other on the device where each
+    member lies; `throw` and `progress` must then be false. NaN fills up `losses`.
+    What a function of `visibilities` needs it must hold as a pytree.
 
     **Example:** the color of a sun.
 
