@@ -56,7 +56,8 @@ def patterns(devices):
 
     def step(image, depth):
         def loss(lens):
-            each = jax.vmap(lambda *frame: dof.scatter(*frame, lens, max_coc=16.0))
+            blurred = lambda image, depth: dof.scatter(image, depth, lens, max_coc=16.0)
+            each = jax.vmap(blurred)
             return jnp.sum((each(image, depth) - image) ** 2)
 
         lens = jax.lax.pcast(LENS, "devices", to="varying")
@@ -96,6 +97,7 @@ def main():
             names, total = moved(compiled.as_text())
             told = ", ".join(f"{names.count(n)} {n}" for n in sorted({*names})) or "none"
             used = compiled.memory_analysis()
+            assert used
             sizes = (
                 used.argument_size_in_bytes,
                 used.output_size_in_bytes,

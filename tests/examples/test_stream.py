@@ -43,7 +43,7 @@ def test_frames_are_refocused_and_what_is_written_stays(tmp_path):
     assert written.stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("is_one_file", [True, False])
+@pytest.mark.parametrize("is_one_file", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_exr_frames_with_depth_are_refocused_and_restarted(tmp_path, is_one_file):
     """Linear values, as they are in the file, and a depth beside or inside each."""
     rng = np.random.default_rng(1)
@@ -57,7 +57,7 @@ def test_exr_frames_with_depth_are_refocused_and_restarted(tmp_path, is_one_file
             exr.write(color, {"": image, "Z": depth})
         else:
             exr.write(color, image)
-            exr.write(tmp_path / "depth" / f"{i:04}.exr", depth)
+            exr.write(tmp_path / "depth" / f"{i:04}.exr", {"Z": depth})
     first, last = (tmp_path / "refocused" / f"{i:04}.png" for i in range(2))
     assert "2/2" in run(tmp_path).stderr
     expected = dof.scatter(image, depth, ThinLens(0.3, 4.0, 20.0), max_coc=6.0)
