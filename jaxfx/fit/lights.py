@@ -60,14 +60,14 @@ class LightsFit(eqx.Module):
       8 tiles of the image are taken for independent of one another, and no others. Never less
       than what noise of a thousandth of the image's root mean square would make; inf where the
       image does not depend on the parameter. Other minima are not in it.
-    - `alike`: light light, which lights the image can't tell apart: it stays the same, to a
-      thousandth of what each change alone would do, when the parameters of both change
+    - `alike`: booleans of shape light light: which lights, by their indices, the image can't
+      tell apart: it stays the same, to a thousandth of what each change alone would do, when the parameters of both change
       together; or they are of one kind, and their positions and directions differ by less than
       three stated errors. Of colors that fit equally well these are the smallest. The
       parameters that take part in the change, and the colors of lights that lie so close, have
       an error of inf.
-    - `unsure`: for each light, by the name of its parameters, whether the error is too large to
-      call it determined.
+    - `unsure`: for each light, by the name of its parameters, a scalar boolean: whether the
+      error is too large to call it determined.
     - `weights`: height width, how much the square of each pixel's difference counted in the
       end.
     - `share`: the share of the given weight, a ratio, that counted in the end, of pixels that
