@@ -61,11 +61,11 @@ class LightsFit(eqx.Module):
       than what noise of a thousandth of the image's root mean square would make; inf where the
       image does not depend on the parameter. Other minima are not in it.
     - `alike`: booleans of shape light light: which lights, by their indices, the image can't
-      tell apart: it stays the same, to a thousandth of what each change alone would do, when the parameters of both change
-      together; or they are of one kind, and their positions and directions differ by less than
-      three stated errors. Of colors that fit equally well these are the smallest. The
-      parameters that take part in the change, and the colors of lights that lie so close, have
-      an error of inf.
+      tell apart: it stays the same, to a thousandth of what each change alone would do, when
+      the parameters of both change together; or they are of one kind, and their positions and
+      directions differ by less than three stated errors. Of colors that fit equally well these
+      are the smallest. The parameters that take part in the change, and the colors of lights
+      that lie so close, have an error of inf.
     - `unsure`: for each light, by the name of its parameters, a scalar boolean: whether the
       error is too large to call it determined.
     - `weights`: height width, how much the square of each pixel's difference counted in the
