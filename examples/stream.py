@@ -3,10 +3,10 @@
     stream.py FOLDER --near 2 --far 8 --aperture 0.1 --focal 800
 
 FOLDER/color holds the frames (PNG, JPEG or EXR) and FOLDER/depth a depth of the same name for
-each (PNG, PFM, NumPy or EXR, in scene units). FOLDER/refocused gets a PNG for each: the focus
-moves from --near in the first to --far in the last. The next frames are read, and the last ones
-written, while one is computed. What is written is written whole, and not computed again when
-the program is started again: delete it for other settings.
+each (PNG, PFM, NumPy or EXR, in scene units); an EXR may hold its own depth. FOLDER/refocused
+gets a PNG for each: the focus moves from --near in the first to --far in the last. The next
+frames are read, and the last ones written, while one is computed. What is written is written
+whole, and not computed again when the program is started again: delete it for other settings.
 """
 
 import argparse
@@ -27,8 +27,10 @@ AHEAD = 2
 
 
 def depth_of(color: Path) -> Path:
-    """The depth of a frame."""
+    """The depth of a frame: a file of its own, or the EXR file of the frame."""
     found = sorted((color.parent.parent / "depth").glob(f"{color.stem}.*"))
+    if not found and color.suffix.lower() == ".exr":
+        return color
     if len(found) != 1:
         fail(f"there must be one depth for {color.name}, found {len(found)}")
     return found[0]

@@ -92,11 +92,12 @@ def _manual_axes() -> tuple[str, ...]:
 
 
 def _axes(*trees: Any) -> frozenset[str]:
-    """All axes over which a leaf of the trees varies."""
+    """All axes over which a leaf of the trees varies; none where `shard_map` checks nothing."""
 
     def axes(leaf: Any) -> frozenset[str]:
         shape: Any = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
-        return shape.manual_axis_type.varying
+        kind = shape.manual_axis_type
+        return frozenset() if kind is None else kind.varying
 
     return frozenset[str]().union(*map(axes, jax.tree.leaves(trees)))
 

@@ -61,8 +61,10 @@ def rows(
     - `axis`: static; the axis of the mesh over which rows are spread: its first by default.
     - `halo`: static; rows that a pixel sees beyond its own, on either side. For a method of
       `dof`, `max_coc / 2 + 2` rounded up, 4 more for `dof.gather`; for `blur.gaussian` half
-      the taps of each pass; for `shadow.pcf` 0. `dof.layered` has no such number where it
-      guesses a second layer: give it `behind=None`, or `dof.peel` of the whole image.
+      the taps of each pass; for `shadow.pcf` 0. That is `dof.layered` with `behind=None`; with
+      a second layer it sees `1.5 * max_coc + 2` rows, and `7.5 * max_coc + 9` where it guesses
+      one (`dof.peel`: at most three steps of each length of its search). With fewer rows it is
+      another image near the edges of a share, which nothing reports.
     - `align`: static; rows are divided at multiples of it: 4 for `dof.gather`, whose
       low-resolution image has a row for 4.
 

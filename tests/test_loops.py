@@ -56,3 +56,13 @@ def test_loops_compute_the_same_inside_shard_map(function):
     # The other axis is not among those over which the result varies, or it would be refused.
     mapped = jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec)
     np.testing.assert_allclose(jax.jit(mapped)(batch), expected)
+
+
+def test_a_loop_inside_an_unchecked_shard_map():
+    """It knows nothing of what varies, and asks for nothing."""
+    batch, spec = jnp.ones((2, 3)), PartitionSpec("batch")
+    mesh = jax.make_mesh((1,), ("batch",), axis_types=(AxisType.Auto,))
+    mapped = jax.shard_map(
+        counted, mesh=mesh, in_specs=spec, out_specs=PartitionSpec(), check_vma=False
+    )
+    np.testing.assert_allclose(jax.jit(mapped)(batch), EXPECTED[counted](np.ones((2, 3))))

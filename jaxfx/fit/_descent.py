@@ -1,4 +1,8 @@
-"""Nonlinear least squares by any solver of optimistix, one step at a time, every loss kept."""
+"""Nonlinear least squares by any solver of optimistix, one step at a time, every loss kept.
+
+Outside of any transform a search is a Python loop, which shows a bar and ends where it may.
+Under `jit` and `vmap` it is a loop of the compiled program, with the same steps and ends.
+"""
 
 import functools
 import math
@@ -11,6 +15,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from jaxfx._checks import is_concrete
+from jaxfx._loops import while_loop
 from jaxfx._progress import Bar
 
 
@@ -41,12 +47,13 @@ def verdict(result: optx.RESULTS) -> Any:
 class End(NamedTuple):
     """Where a search ended.
 
-    - `losses`: the mean squared residual at the start and after every step.
+    - `losses`: the mean squared residual at the start and after every step; under a transform
+      in arrays, which are filled up with NaN.
     - `result`: the verdict of the solver.
     """
 
     unknowns: Any
-    losses: list[Float[Array, ""]]
+    losses: list[Float[Array, "..."]]
     result: optx.RESULTS
 
 
@@ -72,8 +79,8 @@ def descend(
     solver: Solver | None,
     max_steps: int,
     bar: Bar,
-    patience: int = PATIENCE,
-    gain: float = GAIN,
+    patience: Any = PATIENCE,
+    gain: Any = GAIN,
 ) -> End:
     """Search from a start for the least mean square of a residual.
 
@@ -86,6 +93,8 @@ def descend(
     patience = patience if solver is None else max_steps
     solver = _default_solver() if solver is None else solver
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
+    if not is_concrete(residual, unknowns):
+        return _descend_in_program(solver, fn, unknowns, max_steps, patience, gain)
     y, state = unknowns, _begin(solver, fn, unknowns)
     losses, lowest, best, waited = [], math.inf, y, 0
     reason = optx.RESULTS.nonlinear_max_steps_reached
@@ -105,6 +114,64 @@ def descend(
     if not math.isfinite(loss):
         y, loss, reason = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
     return End(y, [*losses, loss], verdict(reason))
+
+
+def _descend_in_program(
+    solver: Any, fn: Any, unknowns: Any, max_steps: int, patience: Any, gain: Any
+) -> End:
+    """The loop of `descend` over traced data."""
+    arrays = lambda tree: jax.tree.map(jnp.asarray, tree)
+    unknowns = arrays(unknowns)
+    successful, going = optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+
+    class State(NamedTuple):
+        count: Any
+        y: Any
+        solver: Any
+        losses: Any
+        lowest: Any
+        best: Any
+        waited: Any
+        has_ended: Any
+        reason: Any
+
+    def step(at: State) -> State:
+        y, state, loss, done, result = _step(solver, fn, at.y, at.solver)
+        waited = jnp.where(loss > (1 - gain) * at.lowest, at.waited + 1, 0)
+        is_lower = loss < at.lowest
+        ends = done | (waited >= patience) | (result != successful)
+        return State(
+            at.count + 1,
+            y,
+            state,
+            at.losses.at[at.count].set(loss),
+            jnp.where(is_lower, loss, at.lowest),
+            jax.tree.map(functools.partial(jnp.where, is_lower), at.y, at.best),
+            waited,
+            ends,
+            optx.RESULTS.where(ends, result, at.reason),
+        )
+
+    inf, zero = jnp.full((), jnp.inf, float), jnp.zeros((), int)
+    first = State(
+        zero,
+        unknowns,
+        _begin(solver, fn, unknowns),
+        jnp.full(max_steps, jnp.nan, float),
+        inf,
+        unknowns,
+        zero,
+        jnp.zeros((), bool),
+        arrays(going),
+    )
+    at = while_loop(lambda at: ~at.has_ended & (at.count < max_steps), step, first)
+    y = _finish(solver, fn, at.y, at.solver, at.losses[at.count - 1], at.reason)
+    loss = _loss(fn, y)
+    diverged = ~jnp.isfinite(loss)
+    y = jax.tree.map(functools.partial(jnp.where, diverged), at.best, y)
+    loss = jax.lax.cond(diverged, lambda: _loss(fn, at.best), lambda: loss)
+    reason = optx.RESULTS.where(diverged, optx.RESULTS.nonlinear_divergence, at.reason)
+    return End(y, [at.losses, loss], verdict(reason))
 
 
 class _Objective(eqx.Module):

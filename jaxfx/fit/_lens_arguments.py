@@ -175,6 +175,15 @@ def check_moves(
         )
 
 
+def check_given(max_coc: Any) -> None:
+    """`ValueError` where a search under a transform lacks its largest diameter."""
+    if max_coc is None:
+        raise ValueError(
+            "`dof(max_coc=...)` must be given under `jit` and `vmap`, where it can't be taken "
+            "from the data: a static diameter in pixels, got None."
+        )
+
+
 def names(
     effect: Effect, parameters: Collection[str] | None, iris: Iris | None
 ) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfx.dof.spoiled import spoiled
+from jaxfx.fit._in_program import each
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Model, Values
 from jaxfx.fit._lens_residual import Residual, evaluate
 
@@ -52,10 +53,10 @@ def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
     """
     difference, drawn, *_ = evaluate(residual, unknowns)
     names = [name for name in unknowns if name in LENS + DISPARITY + IRIS]
-    sensitivity = jnp.zeros_like(drawn)
-    for name in names or [name for name in unknowns if name != "footprint"]:
-        nudged = unknowns | {name: unknowns[name] + _NUDGE}
-        sensitivity = sensitivity + (evaluate(residual, nudged)[1] - drawn) ** 2
+    names = names or [name for name in unknowns if name != "footprint"]
+    nudged = [unknowns | {name: unknowns[name] + _NUDGE} for name in names]
+    change = lambda nudged: (evaluate(residual, nudged)[1] - drawn) ** 2
+    sensitivity = functools.reduce(jnp.add, each(change, nudged, (residual, unknowns)))
     values = residual.model.values(unknowns)
     scale, unit = _noise(residual.model, values, difference, sensitivity, has_edges)
     return dataclasses.replace(residual, scale=scale, unit=unit, is_robust=True)

@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
+from jaxfx._checks import is_concrete
 from jaxfx.dof.arguments import largest_coc
 from jaxfx.fit._descent import End
+from jaxfx.fit._in_program import each, stacked
 from jaxfx.fit._lens_model import LENS, Model, Values
 from jaxfx.fit._lens_noise import weighed
 from jaxfx.fit._lens_residual import Residual, evaluate, mean_size
@@ -68,21 +71,19 @@ class Search(NamedTuple):
         Small images, plain squares: compare lenses, search from the best. The same images,
         edges with a noise of their own: refine the best end. Then the images as given.
         """
-        shrink = _shrink(model)
+        shrink = _shrink(model, self.max_coc)
         images = model.images if shrink == 1 else model.images.shrunk(shrink)
         small = dataclasses.replace(model, images=images)
         small = self._with_bound(small, model.start, _TRIED_MARGIN, shrink)
         residual = self.residual(small)
         starts = self._best_starts(residual)
         origin = _origin(small, self.ratios)
-        losses, ends = [jnp.mean(residual.weighted(evaluate(residual, origin)[0]) ** 2)], []
-        for unknowns in starts:
-            ends.append(self._refine(residual, unknowns))
+        losses = [jnp.mean(residual.weighted(evaluate(residual, origin)[0]) ** 2)]
+        ends = self._refined(residual, starts)
         for name in (name for name in _SOFT if name in model.names):
             best = _ranked(residual, ends)[0].unknowns
-            for factor in _RESTARTS:
-                moved = best | {name: best[name] + math.log(factor)}
-                ends.append(self._refine(residual, moved))
+            moved = [best | {name: best[name] + math.log(factor)} for factor in _RESTARTS]
+            ends += self._refined(residual, moved)
         losses += [loss for end in ends for loss in end.losses]
         ends = _ranked(residual, ends)
         if self.is_robust:
@@ -94,6 +95,10 @@ class Search(NamedTuple):
             small.values(end.unknowns) | {"loss": jnp.asarray(end.losses[-1])} for end in ends
         )
         return residual, end._replace(losses=losses + more), reported
+
+    def _refined(self, residual: Residual, starts: list[Values]) -> list[End]:
+        """The ends of searches from several starts."""
+        return each(lambda start: self._refine(residual, start), starts, residual)
 
     def _refine(self, residual: Residual, unknowns: Values, has_edges: bool = False) -> End:
         """A search whose end is another's start, at the noise of its own start."""
@@ -158,12 +163,12 @@ class Search(NamedTuple):
         at_point = lambda point: {
             name: origin[name] + value for name, value in zip(names, point, strict=True)
         }
-        sizes = [mean_size(residual, origin | at_point(point)) for point in points]
-        sizes = np.asarray(jnp.stack(sizes), float)  # point, photograph
+        size = lambda point: mean_size(residual, origin | at_point(point))
+        sizes = jnp.stack(each(size, points, residual))  # point, photograph
         if self.ratios:
-            sizes = np.broadcast_to(sizes.sum(axis=1, keepdims=True), sizes.shape)
+            sizes = jnp.broadcast_to(sizes.sum(axis=1, keepdims=True), sizes.shape)
         table = [len(factor) for factor in factors]
-        order = np.stack([_lowest(column.reshape(table)) for column in sizes.T])
+        order = jnp.stack([_lowest(column.reshape(table)) for column in sizes.T])
         starts = []
         for rank in order.T:
             chosen = points[rank]  # photograph, name
@@ -180,28 +185,41 @@ def _origin(model: Model, ratios: tuple[str, ...]) -> Values:
     return {name: jnp.zeros(shape(name), float) for name in model.names}
 
 
-def _lowest(losses: np.ndarray) -> np.ndarray:
+def _lowest(losses: Float[Array, "..."]) -> Int[Array, " search"]:
     """Flat indices of the `_SEARCHES` lowest local minima of a table, the lowest first.
 
     Where there are fewer, the last is repeated.
     """
-    padded = np.pad(losses, 1, constant_values=np.inf)
-    around = np.lib.stride_tricks.sliding_window_view(padded, (3,) * losses.ndim)
-    least = losses <= around.min(axis=tuple(range(losses.ndim, 2 * losses.ndim)))
-    places = np.flatnonzero(least)
-    places = places[np.argsort(losses.reshape(-1)[places])][:_SEARCHES]
-    return np.pad(places, (0, _SEARCHES - places.size), mode="edge")
+    window = (3,) * losses.ndim
+    one = (1,) * losses.ndim
+    around = jax.lax.reduce_window(losses, jnp.inf, jax.lax.min, window, one, "SAME")
+    least = jnp.where(losses <= around, losses, jnp.inf).reshape(-1)
+    places = jnp.argsort(least, stable=True)[:_SEARCHES]
+    count = jnp.maximum(jnp.sum(jnp.isfinite(least)), 1)
+    return places[jnp.minimum(jnp.arange(_SEARCHES), count - 1)]
 
 
 def _ranked(residual: Residual, ends: list[End]) -> list[End]:
     """The ends, those first whose images differ least, by the mean absolute difference."""
-    sizes = np.array([float(jnp.sum(mean_size(residual, end.unknowns))) for end in ends])
-    return [ends[at] for at in np.argsort(np.where(np.isfinite(sizes), sizes, np.inf))]
+    size = lambda unknowns: jnp.sum(mean_size(residual, unknowns))
+    sizes = jnp.stack(each(size, [end.unknowns for end in ends], residual))
+    order = jnp.argsort(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf), stable=True)
+    if is_concrete(order):
+        return [ends[at] for at in order.tolist()]
+    mapped = jax.tree.map(lambda leaf: leaf[order], stacked(ends))
+    return [jax.tree.map(lambda leaf, at=at: leaf[at], mapped) for at in range(len(ends))]
 
 
-def _shrink(model: Model) -> int:
-    """The whole factor by which the first images are smaller."""
+def _shrink(model: Model, max_coc: int | float | None) -> int:
+    """The whole factor by which the first images are smaller.
+
+    It decides shapes, so that under a transform it can't depend on data: the largest circle of
+    confusion at the start is then taken for half of `max_coc`.
+    """
     side = max(model.images.depth.shape)
-    circles = model.circles(model.start)
-    largest = float(jnp.max(jnp.where(jnp.isfinite(circles), circles, 0)))
+    if max_coc is not None and not is_concrete(model):
+        largest = max_coc / _TRIED_MARGIN
+    else:
+        circles = model.circles(model.start)
+        largest = float(jnp.max(jnp.where(jnp.isfinite(circles), circles, 0)))
     return max(1, min(math.ceil(side / _COARSE), int(largest / _LEAST_COC)))

@@ -1,13 +1,15 @@
 """Standard errors of lights, and which lights and parameters an image does not determine."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxfx._arrays import ArrayLike
 from jaxfx.fit._jackknife import covariance, independent_errors, tiles
 from jaxfx.fit._light_model import Model, color_shape, mean_point, with_values
 from jaxfx.fit._robust import CUT, flatness, lengths
@@ -40,15 +42,14 @@ _MOST_ERROR = 0.2
 _LEAST_CONTRAST = 0.1
 
 Errors = tuple[dict[str, Float[Array, "..."]], ...]
-Groups = tuple[tuple[int, ...], ...]
 
 
 class Evidence(NamedTuple):
     """The fields of `LightsFit` on how well an image determines its lights."""
 
     standard_errors: Errors
-    indistinct: Groups
-    untold: tuple[tuple[int, str], ...]
+    alike: Bool[Array, "light light"]
+    unsure: tuple[dict[str, Bool[Array, ""]], ...]
     share: Float[Array, ""]
     explained: Float[Array, ""]
 
@@ -82,19 +83,19 @@ def evidence(
     least = LEAST_NOISE * brightness(reference, base_weight)
     floor = independent_errors(columns, jnp.full_like(residual, least))
     errors = jnp.sqrt(jnp.maximum(variances, floor**2))
-    projection = _null_projection(np.asarray(columns, np.float64))
-    is_untold = np.diag(projection) > _SHARED
+    projection = _null_projection(columns)
+    is_untold = jnp.diagonal(projection) > _SHARED
     errors = jnp.where(is_untold | jnp.isnan(errors), jnp.inf, errors)
     owners = [i for i, values in enumerate(map(model.values, lights)) for _ in _flat(values)]
     by_light = _by_light(model, lights, errors)
     near = _near(lights, by_light)
-    for index in {index for pair in near for index in pair}:
-        if "color" in by_light[index]:
-            by_light[index]["color"] = jnp.full(3, jnp.inf)
+    for own, is_near in zip(by_light, near, strict=True):
+        if "color" in own:
+            own["color"] = jnp.where(jnp.any(is_near), jnp.inf, own["color"])
     is_reached = jnp.any(basis != 0, axis=(0, 3))
     return Evidence(
         by_light,
-        _groups([*near, *_dependent(projection, np.array(owners))]),
+        near | _dependent(projection, owners, len(lights)),
         _untold(model, lights, by_light, basis, reference, base_weight),
         jnp.sum(jnp.where(is_reached, weight, 0)) / jnp.sum(base_weight),
         _explained(reference, base_weight, jnp.minimum(length[0], CUT * noise[0])),
@@ -154,17 +155,18 @@ def _untold(
     basis: Float[Array, "color height width 3"],
     reference: Float[Array, "height width 3"],
     base_weight: Float[Array, "height width"],
-) -> tuple[tuple[int, str], ...]:
-    """The parameters that are not determined, as the index of their light and their name.
+) -> tuple[dict[str, Bool[Array, ""]], ...]:
+    """For each light, by name, whether the parameter is not determined.
 
     `basis` is what each color adds to the image if it is white.
     """
-    whole, names = brightness(reference, base_weight), []
+    whole, unsure = brightness(reference, base_weight), []
     fields: tuple[Any, ...] = lights
-    for index, (light, errors_of) in enumerate(zip(fields, errors, strict=True)):
+    for light, errors_of in zip(fields, errors, strict=True):
         count, _ = color_shape(light)
         white, basis = basis[:count], basis[count:]
         lit = base_weight * jnp.sum(white[0], axis=-1)
+        unsure.append({})
         for name, error in errors_of.items():
             size, own = 1.0, error
             if name == "color":
@@ -174,9 +176,8 @@ def _untold(
             elif name == "position":
                 lit_point = mean_point(model.gbuffer, model.camera, lit)
                 size = jnp.linalg.norm(light.position - lit_point)
-            if not jnp.linalg.norm(own) <= _MOST_ERROR * size:
-                names.append((index, name))
-    return tuple(names)
+            unsure[-1][name] = ~(jnp.linalg.norm(own) <= _MOST_ERROR * size)
+    return tuple(unsure)
 
 
 def _flat(values: dict[str, Array]) -> list[Array]:
@@ -198,56 +199,61 @@ def _by_light(
     return tuple(by_light)
 
 
-def _null_projection(columns: Float[np.ndarray, "residual number"]) -> np.ndarray:
-    """The projection, number number, onto combinations of parameters that change nothing.
+def _null_projection(columns: Float[Array, "residual number"]) -> Float[Array, "number number"]:
+    """The projection onto combinations of parameters that change nothing.
 
     Columns of zeros are left out: they are told by their errors.
     """
-    lengths = np.linalg.norm(columns, axis=0)
+    lengths = jnp.linalg.norm(columns, axis=0)
     is_told = lengths > 0
-    columns = columns / np.where(is_told, lengths, 1)
-    squares, vectors = np.linalg.eigh(columns.T @ columns + np.diag(1.0 * ~is_told))
-    null = vectors[:, squares < _DEPENDENT]
-    return null @ null.T
+    columns = columns / jnp.where(is_told, lengths, 1)[None]
+    # Not by eigenvalues of the columns' products, which in float32 are as small by rounding.
+    rows = [jnp.linalg.qr(columns, mode="r"), jnp.diag((~is_told).astype(columns.dtype))]
+    _, sizes, vectors = jnp.linalg.svd(jnp.concatenate(rows), full_matrices=False)
+    is_null = (sizes**2 < _DEPENDENT)[:, None]
+    return vectors.T @ jnp.where(is_null, vectors, 0)
 
 
-def _dependent(projection: np.ndarray, owners: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of lights that take part in one combination of parameters that changes nothing.
+def _dependent(
+    projection: Float[Array, "number number"], owners: Sequence[int], count: int
+) -> Bool[Array, "light light"]:
+    """Which of `count` lights take part in one combination of numbers that changes nothing.
 
     `owners` is the light of each number.
     """
-    lights = np.unique(owners).tolist()
-    shared = lambda i, j: np.linalg.norm(projection[owners == i][:, owners == j])
-    return [(i, j) for i in lights for j in lights if i < j and shared(i, j) > _SHARED]
+    own = jnp.asarray(np.eye(count)[:, np.array(owners, int)], projection.dtype)
+    squares = own @ projection**2 @ own.T
+    return (squares > _SHARED**2) & ~jnp.eye(count, dtype=bool)
 
 
-def _near(lights: tuple[Light, ...], errors: Errors) -> list[tuple[int, int]]:
-    """Pairs of lights of one kind whose fitted places lie within `_APART` joint errors."""
-    pairs = []
+def _near(lights: tuple[Light, ...], errors: Errors) -> Bool[Array, "light light"]:
+    """Which lights of one kind have fitted places within `_APART` joint errors."""
+    near = jnp.zeros((len(lights), len(lights)), bool)
     for i, light in enumerate(lights):
         for j, other in enumerate(lights[:i]):
             names = [name for name in ("position", "direction") if name in errors[i]]
             if type(light) is not type(other) or not names:
                 continue
-            if all(_apart(light, other, name, errors[i], errors[j]) < _APART for name in names):
-                pairs.append((j, i))
-    return pairs
+            apart = [_apart(light, other, name, errors[i], errors[j]) for name in names]
+            is_near = jnp.all(jnp.stack(apart) < _APART)
+            near = near.at[i, j].set(is_near).at[j, i].set(is_near)
+    return near
 
 
-def _apart(first: Any, other: Any, name: str, error: Any, other_error: Any) -> float:
+def _apart(first: Any, other: Any, name: str, error: Any, other_error: Any) -> Array:
     """The distance between the positions or directions of two lights, in joint errors."""
-    values = [np.asarray(getattr(light, name), np.float64) for light in (first, other)]
+    values = [getattr(light, name).astype(float) for light in (first, other)]
     if name == "direction":
-        values = [value / np.linalg.norm(value) for value in values]
-    joint = np.linalg.norm([*np.ravel(error[name]), *np.ravel(other_error[name])])
-    return float(np.linalg.norm(values[0] - values[1]) / joint)
+        values = [value / jnp.linalg.norm(value) for value in values]
+    joint = jnp.concatenate([jnp.reshape(each[name], -1) for each in (error, other_error)])
+    return jnp.linalg.norm(values[0] - values[1]) / jnp.linalg.norm(joint)
 
 
-def _groups(pairs: list[tuple[int, int]]) -> Groups:
-    """The connected components of a graph whose edges are the pairs."""
-    groups: list[set[int]] = []
-    for pair in pairs:
-        touched = [group for group in groups if group & {*pair}]
-        groups = [group for group in groups if group not in touched]
-        groups.append({*pair}.union(*touched))
-    return tuple(sorted(tuple(sorted(group)) for group in groups))
+def groups(alike: Bool[ArrayLike, "light light"]) -> tuple[tuple[int, ...], ...]:
+    """The connected components of a graph, by its matrix, of two lights or more."""
+    found: list[set[int]] = []
+    for pair in np.argwhere(np.triu(np.asarray(alike))).tolist():
+        touched = [group for group in found if group & {*pair}]
+        found = [group for group in found if group not in touched]
+        found.append({*pair}.union(*touched))
+    return tuple(sorted(tuple(sorted(group)) for group in found))

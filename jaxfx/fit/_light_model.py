@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfx._checks import share
+from jaxfx._checks import is_concrete, share
 from jaxfx._numerics import normalize
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
@@ -205,11 +205,16 @@ def best_colors(
     basis: Float[Array, "color height width 3"],
     reference: Float[Array, "height width 3"],
     root: Float[Array, "height width 1"],
-) -> Float[np.ndarray, "3 color"]:
+) -> Float[Any, "3 color"]:
     """The best colors, the smallest of them where several are as good, for the end of a search.
 
     `root` is the root of each pixel's weight.
     """
+    if not is_concrete(basis, reference, root):
+        solve = lambda a, b: jnp.linalg.lstsq(a.reshape(len(a), -1).T, b.ravel(), rcond=1e-6)[0]
+        weight = root.astype(float)
+        columns, right = weight[None] * basis.astype(float), weight * reference.astype(float)
+        return jnp.stack([solve(columns[..., c], right[..., c]) for c in range(3)])
     weight = np.asarray(root, np.float64)
     columns = weight * np.asarray(basis, np.float64)
     right = weight * np.asarray(reference, np.float64)
@@ -220,25 +225,27 @@ def best_colors(
 def spread(gbuffer: GBuffer, camera: _Camera) -> Float[Array, ""]:
     """Root mean square distance of the visible points from their mean; 1 where it is 0."""
     points, shown = _points(gbuffer, camera)
-    points = points[shown]
-    spread = np.sqrt(np.var(points, axis=0).sum()) if len(points) else 0.0
-    return jnp.asarray(spread if spread > 0 else 1.0, float)
+    counts = shown.astype(float)[..., None]
+    share = counts / jnp.maximum(jnp.sum(counts), 1)
+    from_mean = points - jnp.sum(share * points, axis=(0, 1))[None, None]
+    square = jnp.sum(share * from_mean**2)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 1)
 
 
 def mean_point(
     gbuffer: GBuffer, camera: _Camera, weight: Float[Array, "height width"]
-) -> Float[np.ndarray, "3"]:
+) -> Float[Array, "3"]:
     """The mean of the visible points by weight; of all where the weight is 0 everywhere."""
     points, shown = _points(gbuffer, camera)
-    counts = np.where(shown, np.asarray(weight, np.float64), 0)
-    counts = counts if counts.sum() > 0 else np.ones(shown.shape)
-    return np.einsum("hw,hwc->c", counts, points) / counts.sum()
+    counts = jnp.where(shown, weight.astype(float), 0)
+    counts = jnp.where(jnp.sum(counts) > 0, counts, 1)
+    return jnp.einsum("hw,hwc->c", counts / jnp.sum(counts), points)
 
 
-def _points(gbuffer: GBuffer, camera: _Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The point that each pixel shows, in world space, and whether it shows one."""
+def _points(gbuffer: GBuffer, camera: _Camera) -> tuple[Array, Array]:
+    """The point that each pixel shows, in world space, 0 where it shows none; and whether."""
     shown = (gbuffer.depth > 0) & jnp.isfinite(gbuffer.depth)
     height, width = shown.shape
     pixels = pixel_centers(height, width, gbuffer.depth.dtype)
     points = camera.unproject(pixels, jnp.where(shown, gbuffer.depth, 1))
-    return np.asarray(points, np.float64), np.asarray(shown)
+    return points.astype(float), shown

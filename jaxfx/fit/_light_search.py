@@ -7,16 +7,20 @@ would leave out the pixels that show it to be wrong.
 """
 
 import logging
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from jaxfx.fit._descent import End, verdict
+from jaxfx._checks import is_concrete
+from jaxfx._loops import while_loop
+from jaxfx.fit._descent import GAIN, PATIENCE, End, verdict
 from jaxfx.fit._light_errors import LEAST_NOISE, brightness, linearized
 from jaxfx.fit._light_model import (
     Model,
@@ -73,7 +77,9 @@ def search_once(
     descend_on: Callable[..., End],
 ) -> tuple[End, Float[Array, "height width"], Float[Array, "2"]]:
     """One round: an `End` whose unknowns are lights; the weights and the noise at that end."""
-    _warn_of_what_does_not_move(model, lights)
+    is_traced = not is_concrete(model, lights, reference, base_weight)
+    if not is_traced:
+        _warn_of_what_does_not_move(model, lights)
     search = Search(model, lights, spread(model.gbuffer, model.camera))
     unit = brightness(reference, base_weight)
     unknowns, weight, losses = search.unknowns(), base_weight, []
@@ -83,6 +89,11 @@ def search_once(
     fitted = _lights(search, unknowns, reference, jnp.sqrt(base_weight)[..., None])
     if is_robust:  # A lamp in the image, far off from the start, counts little from the first.
         noise, weight = _reweighted(model, fitted, reference, base_weight, noise, unit)
+    if is_traced:
+        start = _Reweighted.of(unknowns, weight, noise)
+        return _search_in_program(
+            search, start, reference, base_weight, unit, is_robust, descend_on
+        )
     for left in reversed(range(_REWEIGHTINGS)):
         root = jnp.sqrt(weight)[..., None]
         is_last = is_last or left == 0
@@ -102,6 +113,83 @@ def search_once(
     square = unit.astype(float) ** 2
     end = End(tuple(fitted), [loss * square for loss in losses], end.result)
     return end, weight, noise
+
+
+class _Reweighted(NamedTuple):
+    """A search under a transform, after `count` reweightings."""
+
+    count: Any
+    unknowns: Any
+    weight: Any
+    noise: Any
+    losses: Any
+    result: Any
+    is_last: Any
+    has_ended: Any
+
+    @classmethod
+    def of(cls, unknowns: Any, weight: Array, noise: Array) -> "_Reweighted":
+        """The start of a search."""
+        no, zero = jnp.zeros((), bool), jnp.zeros((), int)
+        result = verdict(jax.tree.map(jnp.asarray, optx.RESULTS.successful))
+        return cls(zero, unknowns, weight, noise, None, result, no, no)
+
+
+def _search_in_program(
+    search: Search,
+    start: _Reweighted,
+    reference: Array,
+    base_weight: Array,
+    unit: Array,
+    is_robust: bool,
+    descend_on: Callable[..., End],
+) -> tuple[End, Array, Array]:
+    """The loop of `search_once` over traced data."""
+    successful, most = optx.RESULTS.successful, _REWEIGHTINGS if is_robust else 1
+
+    def once(at: _Reweighted) -> tuple[End, list[Any]]:
+        root = jnp.sqrt(at.weight)[..., None]
+        residual = Residual(search, reference, unit, root)
+        if any(at.unknowns):
+            loose, last = _LOOSE, {"patience": PATIENCE, "gain": GAIN}
+            when = {name: jnp.where(at.is_last, last[name], loose[name]) for name in last}
+            end = descend_on(residual, at.unknowns, **when)
+        else:
+            end = End(at.unknowns, [_mean_square(residual, at.unknowns)], at.result)
+        return end, _lights(search, end.unknowns, reference, root)
+
+    def step(at: _Reweighted) -> _Reweighted:
+        end, fitted = once(at)
+        ends = at.is_last | (end.result != successful)
+        noise, weight = at.noise, at.weight
+        is_last = at.is_last
+        if is_robust:
+            noise, weight = _reweighted(
+                search.model, fitted, reference, base_weight, at.noise, unit
+            )
+            change = jnp.max(jnp.abs(weight - at.weight))
+            is_last = (change < _SETTLED * jnp.max(base_weight)) | (at.count + 2 == most)
+        flat = jnp.concatenate([jnp.reshape(loss, -1) for loss in end.losses])
+        return _Reweighted(
+            at.count + 1,
+            end.unknowns,
+            jnp.where(ends, at.weight, weight),
+            jnp.where(ends, at.noise, noise),
+            at.losses.at[at.count].set(flat),
+            end.result,
+            is_last,
+            ends,
+        )
+
+    start = start._replace(is_last=jnp.asarray(not is_robust))
+    steps = jax.eval_shape(lambda at: once(at)[0].losses, start)
+    length = sum(math.prod(loss.shape) for loss in steps)
+    start = start._replace(losses=jnp.full((most, length), jnp.nan, float))
+    at = while_loop(lambda at: ~at.has_ended & (at.count < most), step, start)
+    root = jnp.sqrt(at.weight)[..., None]
+    fitted = _lights(search, at.unknowns, reference, root)
+    losses = [at.losses * unit.astype(float) ** 2]
+    return End(tuple(fitted), losses, verdict(at.result)), at.weight, at.noise
 
 
 @eqx.filter_jit
@@ -128,7 +216,7 @@ def _lights(search, unknowns, reference, root):
     return _colored(lights, best_colors(_basis(search.model, lights), reference, root))
 
 
-def _colored(lights: Sequence[Any], colors: np.ndarray) -> list[Any]:
+def _colored(lights: Sequence[Any], colors: Float[Any, "3 color"]) -> list[Any]:
     """The lights with these colors, 3 color, in their order."""
     rest, colored = jnp.asarray(colors.T, float), []
     for light in lights:

@@ -2,12 +2,15 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._checks import is_concrete
+from jaxfx._loops import scan
 from jaxfx.fit._descent import End
 from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps, report
 from jaxfx.fit._reduction import reduced, shrunk, thinned
@@ -53,16 +56,16 @@ def search(
     median_depth = jnp.nanmedian(jnp.where(is_near, known, jnp.nan)).astype(float)
     unit = jnp.concatenate([jnp.full(3, median_depth), jnp.ones(3, float)])
 
-    def model(views: Views, sigma: float, twist: Array, stride: int = 1) -> Residual:
+    def model(views: Views, sigma: Any, twist: Array, stride: int = 1) -> Residual:
         """The residual of images blurred by `sigma`, with the scale of noise at the twist.
 
         `sigma` is in pixels of the coarser of both images; the finer one is blurred alike in
         the scene.
         """
-        finer = float(views.source.intrinsics[0, 0] / views.start.intrinsics[0, 0])
+        finer = views.source.intrinsics[0, 0] / views.start.intrinsics[0, 0]
         soft = views._replace(
-            reference=blurred(views.reference, jnp.asarray(sigma * max(1 / finer, 1))),
-            image=blurred(views.image, jnp.asarray(sigma * max(finer, 1))),
+            reference=blurred(views.reference, sigma * jnp.maximum(1 / finer, 1)),
+            image=blurred(views.image, sigma * jnp.maximum(finer, 1)),
         )
         clear = clear_of_steps(views.depth, threshold)
         first = Residual(soft, clear, unit, jnp.ones(2, float), threshold, exposure, stride)
@@ -71,9 +74,19 @@ def search(
     small = _small(views)
     twist, losses = jnp.zeros(6, float), []
     sharpest, *coarse = reversed(_sigmas(min(small.reference.shape[:2])))
-    for sigma in reversed(coarse):
+
+    def sharpened(twist: Array, sigma: Any) -> tuple[Array, list[Array]]:
         end = descend_on(model(small, sigma, twist), twist, **_SOON)
-        twist, losses = end.unknowns, losses + end.losses
+        return end.unknowns, end.losses
+
+    if is_concrete(views):
+        for sigma in reversed(coarse):
+            twist, more = sharpened(twist, sigma)
+            losses += more
+    elif coarse:  # One program for all blurs.
+        sigmas = jnp.asarray(coarse[::-1], views.source.intrinsics.dtype)
+        twist, (steps, ends) = scan(sharpened, twist, sigmas)
+        losses.append(jnp.concatenate([steps, ends[:, None]], axis=1))
     last = model(small, sharpest, twist)
     if small is not views:
         end = descend_on(last, twist, **_SOON)

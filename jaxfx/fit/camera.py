@@ -17,6 +17,7 @@ from jaxfx._checks import (
     check,
     check_depth,
     check_image,
+    is_concrete,
     option,
     whole_number,
 )
@@ -24,6 +25,7 @@ from jaxfx._numerics import safe_divide
 from jaxfx._progress import Bar
 from jaxfx.camera import PinholeCamera
 from jaxfx.fit._descent import End, Solver, check_success, descend
+from jaxfx.fit._in_program import fitted_under_transform, joined
 from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._pose_residual import Residual, Views, report
 from jaxfx.fit._pose_search import search
@@ -150,7 +152,9 @@ def camera(
     or a depth that is nowhere known. `RuntimeError` where the fit is no success and `throw` is
     true.
 
-    **Gradient:** none through the search: it stops at every step to report.
+    **Gradient:** none through the search: it stops at every step to report. Under `jit` and
+    `vmap` it is a part of the program, of a batch one after the other on the device where each
+    member lies; `throw` and `progress` must then be false. NaN fills up `losses`.
 
     **Example:** an image is registered to itself.
 
@@ -194,10 +198,16 @@ def camera(
     max_steps = whole_number("camera(max_steps=...)", max_steps)
     hole_threshold = check_threshold("camera", hole_threshold)
     option("camera(exposure=...)", exposure, get_args(Exposure))
-    with Bar(progress, "fit") as bar:
+
+    def fitted_to(views: Views, bar: Bar) -> CameraFit:
         descend_on = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
-        model, end = search(views, hole_threshold, exposure == "free", descend_on)
-    fitted = _fitted(model, end)
+        return _fitted(*search(views, hole_threshold, exposure == "free", descend_on))
+
+    if not is_concrete(views):
+        quiet = functools.partial(fitted_to, bar=Bar(False, "fit"))
+        return fitted_under_transform(quiet, views, "camera", throw, progress)
+    with Bar(progress, "fit") as bar:
+        fitted = fitted_to(views, bar)
     if throw:
         check_success(fitted, "camera", "pose")
     return fitted
@@ -217,7 +227,7 @@ def _fitted(model: Residual, end: End) -> CameraFit:
         camera=model.moved(end.unknowns),
         gain=compared.gain,
         offset=compared.offset,
-        losses=jnp.stack(end.losses),
+        losses=joined(end.losses),
         covariance=jnp.where(share > 0, spread, jnp.inf),
         share=share,
         explained=jnp.where(contrast > 0, 1 - safe_divide(rest, contrast), 0),

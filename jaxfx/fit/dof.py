@@ -14,11 +14,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, WholeNumber, number, whole_number
+from jaxfx._checks import Number, WholeNumber, is_concrete, number, whole_number
 from jaxfx._progress import Bar
 from jaxfx.dof.iris import Iris, check_iris
 from jaxfx.fit import _circle_error, _lens_arguments as read
 from jaxfx.fit._descent import End, Solver, check_success, descend
+from jaxfx.fit._in_program import fitted_under_transform, joined
 from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Model, Values
 from jaxfx.fit._lens_noise import defocus
@@ -208,7 +209,11 @@ def dof(
     confusion below a pixel or above `max_coc`), or an image that is not finite.
     `RuntimeError` where the fit is no success and `throw` is true.
 
-    **Gradient:** none through the search: it stops at every step to report.
+    **Gradient:** none through the search: it stops at every step to report. Under `jit` and
+    `vmap` it is a part of the program, of a batch one after the other on the device where each
+    member lies; `throw` and `progress` must then be false, and `max_coc` be given.
+    For it the images of the first searches are smaller by a factor that follows from
+    `max_coc`, and NaN fills up `losses`.
 
     **Example:** the aperture of a blurred image.
 
@@ -244,7 +249,11 @@ def dof(
     if max_coc is not None:
         is_diameter = lambda x: 0 < x < math.inf
         max_coc = number("dof(max_coc=...)", max_coc, is_diameter, "positive and finite")
-    read.check_moves(names, lenses, images, max_coc)
+    is_traced = not is_concrete(images, start, iris)
+    if is_traced:
+        read.check_given(max_coc)
+    else:
+        read.check_moves(names, lenses, images, max_coc)
     is_robust, is_free = loss == "robust", exposure == "free"
     if is_robust:
         images = read.without_saturated(images)
@@ -252,11 +261,18 @@ def dof(
     if is_robust and iris is None and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
     model = Model(images, start, jnp.zeros(()), iris, names, effect, 1.0)
-    with Bar(progress, "fit") as bar:
+    ratios = read.ratios(ratios)
+
+    def fitted_to(model: Model, bar: Bar) -> DofFit:
         solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         residual = functools.partial(plain, exposure=is_free, tone=tone)
-        search = Search(residual, solve, is_robust, max_coc, read.ratios(ratios))
-        fitted = _fitted(*search.run(model))
+        return _fitted(*Search(residual, solve, is_robust, max_coc, ratios).run(model))
+
+    if is_traced:
+        quiet = functools.partial(fitted_to, bar=Bar(False, "fit"))
+        return fitted_under_transform(quiet, model, "dof", throw, progress)
+    with Bar(progress, "fit") as bar:
+        fitted = fitted_to(model, bar)
     if throw:
         check_success(fitted, "dof", "lens")
     return fitted
@@ -291,7 +307,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
         gain=reported.gain,
         offset=reported.offset,
         images=reported.drawn if is_plain else evaluate(without_footprint, end.unknowns)[1],
-        losses=jnp.stack(end.losses),
+        losses=joined(end.losses),
         ends=ends,
         standard_errors=standard_errors,
         explained=jnp.where(contrast > 0, 1 - unexplained / contrast, 1) * share,

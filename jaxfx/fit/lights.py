@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arguments import check_camera, check_gbuffer, check_lights
 from jaxfx._arrays import ArrayLike
@@ -18,6 +18,7 @@ from jaxfx._checks import (
     check,
     check_depth,
     check_image,
+    is_concrete,
     items,
     option,
     share,
@@ -26,7 +27,8 @@ from jaxfx._checks import (
 from jaxfx._progress import Bar
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.fit._descent import End, Solver, check_success, descend
-from jaxfx.fit._light_errors import evidence, linearized
+from jaxfx.fit._in_program import fitted_under_transform, joined
+from jaxfx.fit._light_errors import evidence, groups, linearized
 from jaxfx.fit._light_model import Model, free
 from jaxfx.fit._light_search import search_in_rounds, search_once
 from jaxfx.gbuffer import GBuffer
@@ -58,14 +60,14 @@ class LightsFit(eqx.Module):
       8 tiles of the image are taken for independent of one another, and no others. Never less
       than what noise of a thousandth of the image's root mean square would make; inf where the
       image does not depend on the parameter. Other minima are not in it.
-    - `indistinct`: groups of lights, by their indices, that the image can't tell apart: it
-      stays the same, to a thousandth of what each change alone would do, when the parameters of
-      all lights of the group change together; or they are of one kind, and their positions and
+    - `alike`: booleans of shape light light: which lights, by their indices, the image can't
+      tell apart: it stays the same, to a thousandth of what each change alone would do, when
+      the parameters of both change together; or they are of one kind, and their positions and
       directions differ by less than three stated errors. Of colors that fit equally well these
       are the smallest. The parameters that take part in the change, and the colors of lights
       that lie so close, have an error of inf.
-    - `untold`: the parameters whose error is too large to call them determined, as the index of
-      their light and their name.
+    - `unsure`: for each light, by the name of its parameters, a scalar boolean: whether the
+      error is too large to call it determined.
     - `weights`: height width, how much the square of each pixel's difference counted in the
       end.
     - `share`: the share of the given weight, a ratio, that counted in the end, of pixels that
@@ -80,12 +82,27 @@ class LightsFit(eqx.Module):
     image: Float[Array, "height width 3"]
     losses: Float[Array, " steps"]
     standard_errors: tuple[dict[str, Float[Array, "..."]], ...]
-    indistinct: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    untold: tuple[tuple[int, str], ...] = eqx.field(static=True)
+    alike: Bool[Array, "light light"]
+    unsure: tuple[dict[str, Bool[Array, ""]], ...]
     weights: Float[Array, "height width"]
     share: Float[Array, ""]
     explained: Float[Array, ""]
     result: optx.RESULTS
+
+    @property
+    def indistinct(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of lights that are `alike`, by their indices."""
+        return groups(self.alike)
+
+    @property
+    def untold(self) -> tuple[tuple[int, str], ...]:
+        """The parameters that are `unsure`, as the index of their light and their name."""
+        return tuple(
+            (index, name)
+            for index, own in enumerate(self.unsure)
+            for name in own
+            if bool(own[name])
+        )
 
     @property
     def doubt(self) -> str:
@@ -161,7 +178,10 @@ def lights(
     that differ, parameters that no light has, a reference that is not finite, or a start where
     nothing changes the image. `RuntimeError` where the fit is no success and `throw` is true.
 
-    **Gradient:** none through the search: it stops at every step to report.
+    **Gradient:** none through the search: it stops at every step to report. Under `jit` and
+    `vmap` it is a part of the program, of a batch one after the other on the device where each
+    member lies; `throw` and `progress` must then be false. NaN fills up `losses`.
+    What a function of `visibilities` needs it must hold as a pytree.
 
     **Example:** the color of a sun.
 
@@ -206,7 +226,9 @@ def lights(
     option("lights(loss=...)", loss, get_args(Loss))
     rounds = whole_number("lights(rounds=...)", rounds)
     max_steps = whole_number("lights(max_steps=...)", max_steps)
-    with Bar(progress, "fit") as bar:
+
+    def fitted_to(data: Any, bar: Bar) -> LightsFit:
+        start, reference, gbuffer, camera, base_weight, visibilities = data
         descend_on = partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         model, end, weight, noise = search_in_rounds(
             rounds,
@@ -217,7 +239,14 @@ def lights(
                 model, lights, reference, base_weight, loss == "robust", descend_on
             ),
         )
-    fitted = _fitted(model, end, reference, base_weight, weight, noise)
+        return _fitted(model, end, reference, base_weight, weight, noise)
+
+    data = start, reference, gbuffer, camera, base_weight, visibilities
+    if not is_concrete(data):
+        quiet = partial(fitted_to, bar=Bar(False, "fit"))
+        return fitted_under_transform(quiet, data, "lights", throw, progress)
+    with Bar(progress, "fit") as bar:
+        fitted = fitted_to(data, bar)
     if throw:
         check_success(fitted, "lights", "lights")
     return fitted
@@ -233,7 +262,7 @@ def _fitted(
     return LightsFit(
         lights=lights,
         image=image,
-        losses=jnp.stack(end.losses),
+        losses=joined(end.losses),
         weights=weight,
         result=end.result,
         **quality._asdict(),

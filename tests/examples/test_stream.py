@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxfx import ThinLens, dof, io
+from jaxfx import ThinLens, dof, exr, io
 
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -41,6 +41,31 @@ def test_frames_are_refocused_and_what_is_written_stays(tmp_path):
     (tmp_path / "refocused" / "0001.png").unlink()
     assert "1/1" in run(tmp_path).stderr
     assert written.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("is_one_file", [True, pytest.param(False, marks=pytest.mark.full)])
+def test_exr_frames_with_depth_are_refocused_and_restarted(tmp_path, is_one_file):
+    """Linear values, as they are in the file, and a depth beside or inside each."""
+    rng = np.random.default_rng(1)
+    (tmp_path / "color").mkdir()
+    (tmp_path / "depth").mkdir()
+    image = rng.uniform(0, 1, (12, 10, 3)).astype(np.float32)
+    depth = rng.uniform(1.5, 6, (12, 10)).astype(np.float32)
+    for i in range(2):
+        color = tmp_path / "color" / f"{i:04}.exr"
+        if is_one_file:
+            exr.write(color, {"": image, "Z": depth})
+        else:
+            exr.write(color, image)
+            exr.write(tmp_path / "depth" / f"{i:04}.exr", {"Z": depth})
+    first, last = (tmp_path / "refocused" / f"{i:04}.png" for i in range(2))
+    assert "2/2" in run(tmp_path).stderr
+    expected = dof.scatter(image, depth, ThinLens(0.3, 4.0, 20.0), max_coc=6.0)
+    np.testing.assert_allclose(io.read_color(last), np.clip(expected, 0, 1), atol=0.005)
+    before = last.stat().st_mtime_ns
+    first.unlink()
+    assert "1/1" in run(tmp_path).stderr
+    assert first.exists() and last.stat().st_mtime_ns == before
 
 
 @pytest.mark.full

@@ -1,12 +1,51 @@
 """Batches that are spread over eight devices along their first axis, effect by effect."""
 
+import importlib
+import inspect
+import pkgutil
+
 import pytest
 
+import jaxfx
+from tests.helpers.fits import FITS
 from tests.test_transforms import CASES, FUNCTIONS
 
 
 QUICK = ("dof.gather", "shadow.edge_pcf")
 MESHES = ("explicit", "auto", "shard_map")
+
+
+# Public functions that no batch of images goes through: files, meshes, measurements and plans
+# run Python until they are done; the reference of many pinhole images calls a renderer.
+NO_BATCH = {
+    *("blur.binomial_weights", "dof.accumulate", "relight.capture_normals"),
+    *("shadow.candidates", "shadow.light_cameras", "sharding.rows", "sharding.target_rows"),
+    *("budget.accumulate", "budget.dof", "budget.relight", "budget.reproject", "budget.shadow"),
+    *("exr.read", "exr.read_gbuffer", "exr.read_rgbd", "exr.write", "exr.write_gbuffer"),
+    *("io.linear_from_srgb", "io.read_color", "io.read_depth", "io.read_png"),
+    *("io.srgb_from_linear", "io.write_png"),
+    *("scene.default_camera", "scene.default_lights", "scene.depth", "scene.from_trimesh"),
+    *("scene.gbuffer", "scene.load", "scene.material_ids", "scene.object_ids"),
+    *("scene.plan_views", "scene.still_life", "scene.transfer", "scene.visible"),
+    *("tradeoff.measure", "tradeoff.pareto", "tradeoff.plot", "tradeoff.save"),
+}
+
+
+def test_every_public_function_is_in_a_list():
+    """A new effect is tested as a batch by itself, or fails here until it is named."""
+    public = set()
+    for module in pkgutil.iter_modules(jaxfx.__path__):
+        if module.name.startswith("_"):
+            continue
+        face = importlib.import_module(f"jaxfx.{module.name}")
+        for name in getattr(face, "__all__", ()):
+            function = getattr(face, name)
+            if callable(function) and not inspect.isclass(function):
+                public.add(f"{module.name}.{name}")
+    fits = {f"fit.{name.partition(',')[0]}" for name in FITS}
+    assert public == {*FUNCTIONS, *fits, *NO_BATCH}
+    tested = {case.function for case in CASES.values()}
+    assert tested == set(FUNCTIONS.values())
 
 
 def assert_divided(answer):

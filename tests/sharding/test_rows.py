@@ -29,6 +29,15 @@ def test_rows_of_any_height_are_those_of_one_device(eight_devices, name, mesh, h
 
 
 @pytest.mark.full
+@pytest.mark.parametrize(
+    ("name", "height"), [("layered, two", 96), ("layered, two", 90), ("layered, peel", 433)]
+)
+def test_rows_of_two_layers_see_as_far_as_is_documented(eight_devices, name, height):
+    """A guessed second layer is found by steps that see far."""
+    assert_same(eight_devices("rows", name=name, mesh="auto", height=height))
+
+
+@pytest.mark.full
 @pytest.mark.parametrize("mesh", ["explicit", "auto"])
 @pytest.mark.parametrize("height", [16, 13])
 def test_rows_of_a_view_are_shared_out(eight_devices, mesh, height):

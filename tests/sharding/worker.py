@@ -20,6 +20,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from jaxfx import PinholeCamera, ThinLens, blur, dof, reproject, shadow, sharding
 from tests.helpers import quick
+from tests.helpers.fits import FITS
 from tests.test_transforms import CASES
 
 
@@ -71,12 +72,35 @@ def stacked(name, size):
 
 
 def batch(name, mesh, gradient=True, size=(9, 7), shape=(DEVICES,), names=("batch",)):
-    """A batch of a case over eight devices against one device.
+    """A batch of a case over eight devices against one device."""
+    call, with_gradient, batch = stacked(name, size)
+    each = jax.vmap(with_gradient if gradient else call)
+    if not gradient or mesh == "shard_map":
+        return divided(each, batch, mesh, shape, names)
+
+    def energy(floats, others):
+        out = jax.vmap(call)(eqx.combine(floats, others))
+        leaves = jax.tree.leaves(eqx.filter(out, eqx.is_inexact_array))
+        return sum(jnp.sum(leaf**2) for leaf in leaves) / 2
+
+    def both(batch):
+        """The gradient of each member, and that of a sum over all members."""
+        return each(batch), jax.grad(energy)(*eqx.partition(batch, eqx.is_inexact_array))
+
+    return divided(both, batch, mesh, shape, names)
+
+
+def fits(name, mesh):
+    """A fit of each of eight frames or starts, over eight devices against one device."""
+    fitted, data = FITS[name](DEVICES)
+    return divided(jax.vmap(lambda data: fitted(*data)), data, mesh)
+
+
+def divided(mapped, batch, mesh, shape=(DEVICES,), names=("batch",)):
+    """A function of a batch over eight devices against one device.
 
     `mesh` is "explicit" or "auto", for `jit(vmap(f))`, or "shard_map".
     """
-    call, with_gradient, batch = stacked(name, size)
-    mapped = jax.vmap(with_gradient if gradient else call)
     expected = jax.jit(mapped)(batch)
     devices, spec = mesh_of(mesh, shape, names), PartitionSpec(names[0])
     placed = jax.device_put(batch, NamedSharding(devices, spec))
@@ -106,12 +130,19 @@ def picture(height, width=7):
     return image, depth, seen
 
 
+def _two_layers(image, depth, hidden, farther, lens):
+    """`layered` with a second layer, whose rows are spread as well."""
+    return dof.layered(image, depth, lens, max_coc=6.0, behind=(hidden, farther))
+
+
 LENS = ThinLens(0.3, 2.5, 20.0)
 MAP = np.random.default_rng(4).uniform(1.1, 4, (10, 10))
 # The halo of each effect, where rows have to be divided, its images and what has no rows.
 BY_ROWS = {
     "scatter": (5, 1, dof.scatter, 2, {"lens": LENS, "max_coc": 6.0}),
     "layered": (5, 1, dof.layered, 2, {"lens": LENS, "max_coc": 6.0, "behind": None}),
+    "layered, two": (11, 1, _two_layers, 4, {"lens": LENS}),
+    "layered, peel": (54, 1, dof.layered, 2, {"lens": LENS, "max_coc": 6.0}),
     "gather": (8, 4, dof.gather, 2, {"lens": LENS, "max_coc": 6.0}),
     "separable": (5, 1, dof.separable, 2, {"lens": LENS, "max_coc": 6.0}),
     "blur": (4, 1, blur.gaussian, 1, {"sigma": jnp.asarray(1.5), "taps": 9}),
@@ -128,7 +159,11 @@ BY_ROWS = {
 def rows(name, mesh, height):
     """An effect of an image whose rows lie on eight devices, and its gradient."""
     halo, align, effect, which, others = BY_ROWS[name]
-    images = picture(height)[which if isinstance(which, slice) else slice(which)]
+    image, depth, seen = picture(height)
+    given = image, depth, seen
+    if which == 4:  # The second layer lies behind the first.
+        given = image, depth, image[::-1], depth + 1 + depth[::-1]
+    images = given[which if isinstance(which, slice) else slice(which)]
     devices = mesh_of(mesh)
     divided = sharding.rows(effect, devices, halo=halo, align=align)
     arrays, static = eqx.partition(others, eqx.is_array)
@@ -206,6 +241,8 @@ def page():
     slope = jax.grad(lambda lens: losses(lens).sum())(lens)
     assert min(abs(leaf) for leaf in jax.tree.leaves(slope)) > 0
     program = step.lower(lens, *frames, frames[0]).compile()
+    assert names["doubts"] == [""] * DEVICES
+    np.testing.assert_allclose(names["found"].lens.aperture, 0.1, rtol=1e-2)
     whole = dof.scatter(names["image"], names["depth"], lens, max_coc=6.0)
     return {
         "error": error(
@@ -225,6 +262,7 @@ CHECKS = {
     "page": page,
     "memory": memory,
     "batch": batch,
+    "fits": fits,
     "rows": rows,
     "target_rows": target_rows,
 }
