@@ -287,7 +287,8 @@ def received(
     """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
     if isinstance(light, SphericalHarmonicsLight):
-        return _from_around(surface, surface.normal, light.coefficients), None, None
+        irradiance = harmonic_irradiance(surface.normal, light.coefficients)
+        return _on_matt(surface, irradiance), None, None
     if isinstance(light, EnvironmentLight):
         return _from_surroundings(surface, light)
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
@@ -312,19 +313,13 @@ def received(
     return (1 - grazing) * diffuse, (1 - grazing) * specular, grazing * specular
 
 
-def _from_around(
-    surface: Surface, normal: _Vectors, coefficients: Float[Array, "9 3"]
-) -> _Vectors:
-    """The diffuse light of a radiance with these coefficients; none where a normal is zero.
-
-    `normal` is in the axes of the coefficients.
-    """
-    diffuse = harmonic_irradiance(normal, coefficients)
+def _on_matt(surface: Surface, irradiance: _Vectors) -> _Vectors:
+    """The diffuse light, of an irradiance from all around; none where a normal is zero."""
     has_normal = _dot(surface.normal, surface.normal) != 0
     if surface.facing is not None:
         is_ggx = surface.shader == _GGX
-        diffuse *= jnp.where(is_ggx, 1 - mean_grazing(surface.facing), 1)[..., None]
-    return jnp.where(has_normal[..., None], diffuse, 0)
+        irradiance *= jnp.where(is_ggx, 1 - mean_grazing(surface.facing), 1)[..., None]
+    return jnp.where(has_normal[..., None], irradiance, 0)
 
 
 def _from_surroundings(
@@ -333,16 +328,17 @@ def _from_surroundings(
     """The three parts of the light of an image of all directions."""
     column = lambda k: jnp.broadcast_to(light.world_from_image[:, k], surface.normal.shape)
     turned = lambda way: jnp.stack([_dot(way, column(k)) for k in range(3)], axis=-1)
-    color = light.color[None, None]
-    diffuse = color * _from_around(surface, turned(surface.normal), light.coefficients)
+    color, blurs = light.color[None, None], (light.pyramid, light.heights)
+    irradiance = _environment.irradiance(*blurs, turned(surface.normal))
+    diffuse = color * _on_matt(surface, irradiance)
     if surface.facing is None:
         return diffuse, None, None
     mirrored = 2 * surface.facing[..., None] * surface.normal - surface.to_camera
     lobe = mean_lobe(surface.facing, jnp.sqrt(roughness_squared(surface.exponent)))
     toward = surface.normal + lobe.mirrored[..., None] * (mirrored - surface.normal)
-    reflected = _environment.look_up(
-        light.pyramid, light.heights, turned(toward), lobe.roughness
-    )
+    rest = _environment.look_up(*blurs, turned(toward), lobe.roughness)
+    matt = lobe.matt[..., None]
+    reflected = matt * irradiance + (1 - matt) * rest
     is_ggx = (surface.shader == _GGX) & (_dot(surface.normal, surface.normal) != 0)
     specular, grazing = (
         jnp.where(is_ggx[..., None], color * reflected * mean[..., None], 0)
