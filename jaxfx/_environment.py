@@ -6,9 +6,10 @@ the right of the middle, b that above the horizon.
 
 A blur is for one roughness: the mean of the radiance about a direction, weighted by GGX's lobe
 as it is seen straight on. That of roughness 1 is the cosine: the blur holds what a matt surface
-shows. Past 1 it passes over into the mean of a half sphere. Directions of one row differ by a turn about y: so a blur is a
-product of matrices over rows and a convolution along them, which is a product after a Fourier
-transform.
+shows. Past 1 it passes over into the mean of a half sphere.
+
+Directions of one row differ by a turn about y: so a blur is a product of matrices over rows and
+a convolution along them, which is a product after a Fourier transform.
 
 Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001, the nine coefficients. Blurring
 by a Fourier transform along rows, and the blurs past 1, are our own.
@@ -27,7 +28,7 @@ from jaxfx._numerics import safe_sqrt
 
 
 # The roughness of each level, and the most rows that it has, some two to a lobe's width. Level
-# 0 is the image, the last one a half sphere's mean. More rows take memory with their cube; fewer
+# 0 is the image, the last a half sphere's mean. More rows take memory with their cube; fewer
 # blur once more.
 ROUGHNESSES = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 2.0)
 _MOST_ROWS = (128, 64, 64, 32, 32, 32, 32, 32)
@@ -97,7 +98,7 @@ def _means(size: int, to: int) -> Float[np.ndarray, "to size"]:
     return np.maximum(high - low, 0) * (to / size)
 
 
-def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
+def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "16 3"]:
     """The coefficients of `_harmonics`, in the image's axes."""
     height, width = image.shape[:2]
     # Means over texels, in which the radiance is even: by four nodes along each side.
@@ -106,13 +107,16 @@ def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
     mean = lambda values: values @ (weights / 2)
     angle = ((np.arange(width)[:, None] + inside) / width - 0.5) * 2 * np.pi
     s, c = np.sin(angle), np.cos(angle)
-    columns = [mean(value) for value in (1 + 0 * s, s, c, s * s, s * c, c * c)]
+    columns = [1 + 0 * s, s, c, s * s, s * c, c * c]
+    columns += [s * s * s, s * s * c, s * c * c, c * c * c]
+    columns = [mean(value) for value in columns]
     along = jnp.asarray(np.stack(columns), image.dtype)
     rows = jnp.einsum("kw,hwc->khc", along, image, precision="highest")
     above = (0.5 - (np.arange(height)[:, None] + inside) / height) * np.pi
     y, r = np.sin(above), np.cos(above)
     solid_angle = r * 2 * np.pi**2 / (height * width)
-    # 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy, as (row's factor, index of `along`).
+    # The polynomials of `_harmonics`, as (row's factor, index of `along`): y is constant along
+    # a row, x is r * s, z is -r * c.
     polynomials = [
         [(1 + 0 * y, 0)],
         [(y, 0)],
@@ -123,8 +127,15 @@ def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
         [(3 * r * r, 5), (-1 + 0 * y, 0)],
         [(-r * r, 4)],
         [(r * r, 3), (-y * y, 0)],
+        [(3 * y * r**2, 3), (-(y**3), 0)],
+        [(-y * r**2, 4)],
+        [(5 * y * r**2, 5), (-y, 0)],
+        [(-5 * r**3, 9), (3 * r, 2)],
+        [(5 * r**3, 8), (-r, 1)],
+        [(-(r**3), 7), (r * y * y, 2)],
+        [(r**3, 6), (-3 * r * y * y, 1)],
     ]
-    factors = np.zeros((9, 6, height))
+    factors = np.zeros((16, len(columns), height))
     for k, terms in enumerate(polynomials):
         for factor, index in terms:
             factors[k, index] = mean(factor * solid_angle) * FACTORS[k]

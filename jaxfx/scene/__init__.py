@@ -13,6 +13,7 @@
 | traced shadows | `visible` |
 | where to put few cameras that see what many see | `plan_views` |
 | one bounce of indirect light | `transfer`, then `relight.indirect` |
+| shadows of light from all around | `occlusion`, a visibility of `relight` |
 
 OpenGL or Embree finds the face that every pixel shows; NumPy does the rest. Nothing here can be
 differentiated or traced. World axes are the mesh file's (y up in most of them); cameras are
@@ -22,6 +23,7 @@ those of `jaxfx`.
 from jaxfx.scene._defaults import default_camera, default_lights
 from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._occlusion import occlusion
 from jaxfx.scene._plan import ViewPlan, plan_views
 from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Scene, Viewpoint
@@ -43,6 +45,7 @@ __all__ = [
     "load",
     "material_ids",
     "object_ids",
+    "occlusion",
     "plan_views",
     "still_life",
     "transfer",
