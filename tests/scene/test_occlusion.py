@@ -112,6 +112,7 @@ def test_light_from_all_around_casts_shadows(stage, radiance, least):
         assert found > least
 
 
+@pytest.mark.full
 def test_many_lights_edits_and_ggx_agree(stage):
     mesh, gbuffer, camera = stage
     occlusion = np.asarray(scene.occlusion(mesh, gbuffer, camera, ray_count=16), float)
