@@ -201,7 +201,9 @@ def test_the_table_is_between_0_and_1():
     lobe = mean_lobe(jnp.asarray(cosine), jnp.asarray(roughness))
     for part in lobe[:4]:
         assert (part >= -1e-3).all()
+    for part in lobe[:3]:
         assert (part <= 1.001).all()
+    assert (lobe.mirrored <= 1.03).all()
     assert (lobe.roughness >= 0).all()
     assert (lobe.roughness <= 2).all()
     assert (lobe.specular + lobe.grazing <= 1.001).all()

@@ -122,7 +122,8 @@ def mean_lobe(to_camera: _Scalars, roughness: _Scalars) -> MeanLobe:
     Karis looks into the mirrored direction, with the roughness of the surface. Here the lobe is
     two: one about the normal, which is what a matt surface gets, and a blur about a direction
     on the way to the mirrored one. Their sum has the lobe's own mean, direction and length:
-    radiance that is linear in the direction is returned exactly. That is our own.
+    radiance that is linear in the direction is returned exactly, but at grazing angles by the
+    roughest surfaces, whose lobe is wider than any blur. That is our own.
 
     Source: Karis 2013, the split sum.
     """

@@ -143,6 +143,36 @@ def environment_highlights(method):
     return Found({"rms": float(np.sqrt(np.mean(error**2)))}, image / expected.max())
 
 
+# Surroundings, and the degree of the spherical harmonics.
+SHADOWED = {
+    "clouds, 9 numbers": ("clouds", 2),
+    "clouds, 16 numbers": ("clouds", 3),
+    "lamps, 9 numbers": ("lamps", 2),
+    "lamps, 16 numbers": ("lamps", 3),
+    "a sun, 16 numbers": ("sun", 3),
+}
+
+
+@case("relight", {"rms": 10 ** (-35 / 20)}, SHADOWED, needs="embreex")
+def surroundings_in_shadow(method):
+    """A floor beside a wall in surroundings, by `scene.occlusion`, against the sum over all
+    directions: rms error over the brightest value; the bound is 35 dB. Few numbers make the
+    shadow of a small lamp soft, and lose what a wall cuts sharply."""
+    from jaxfx import scene
+    from tests import test_environment as balls
+    from tests.scene.test_occlusion import floor_and_wall, traced
+
+    name, degree = SHADOWED[method]
+    mesh, gbuffer, camera = floor_and_wall()
+    radiance = getattr(balls, name)
+    occlusion = scene.occlusion(mesh, gbuffer, camera, ray_count=1024, degree=degree)
+    light = EnvironmentLight(radiance(balls.directions(32)[0]), balls.TURN)
+    image = np.asarray(relight.shade(gbuffer, camera, light, occlusion))
+    expected = traced(gbuffer, camera, radiance, balls.TURN)
+    error = (image - expected) / expected.max()
+    return Found({"rms": float(np.sqrt(np.mean(error**2)))}, image / expected.max())
+
+
 @case(
     "relight",
     {"below 0": 0.01},

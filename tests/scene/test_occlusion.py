@@ -44,9 +44,8 @@ def functions(way):
     return np.stack(found, axis=-1)
 
 
-@pytest.fixture(scope="module")
-def stage():
-    """A floor at y = 0, a wall at z = -1, three high and four wide."""
+def floor_and_wall():
+    """A floor at y = 0, a wall at z = -1, three high and four wide; its cache and camera."""
     floor = rectangle([[-5, 0, 5], [5, 0, 5], [5, 0, -5], [-5, 0, -5]])
     wall = rectangle([[-2, 0, -1], [2, 0, -1], [2, 3, -1], [-2, 3, -1]])
     camera = PinholeCamera.look_at(
@@ -58,6 +57,9 @@ def stage():
     return mesh, gbuffer, camera
 
 
+stage = pytest.fixture(scope="module")(floor_and_wall)
+
+
 def arrives(camera, gbuffer, way):
     """The cosine over pi by which light from each direction falls on each pixel's floor."""
     position = np.asarray(camera.points(np.asarray(gbuffer.depth, float))).reshape(-1, 1, 3)
@@ -67,6 +69,13 @@ def arrives(camera, gbuffer, way):
     is_blocked = (distance > 0) & (np.abs(where[..., 0]) < 2)
     is_blocked &= (where[..., 1] > 0) & (where[..., 1] < 3)
     return np.where(is_blocked, 0, np.maximum(way[:, 1], 0) / np.pi)
+
+
+def traced(gbuffer, camera, radiance, turn):
+    """The floor by the sum over all directions."""
+    way, solid_angle = (part.reshape(-1, *part.shape[2:]) for part in directions(96))
+    weights = arrives(camera, gbuffer, way) * solid_angle
+    return np.asarray(gbuffer.diffuse) * (weights @ radiance(way @ turn)).reshape(6, 8, 3)
 
 
 def test_it_is_the_integrals_over_what_is_free(stage):
@@ -100,13 +109,11 @@ def test_light_from_all_around_casts_shadows(stage, radiance, least):
     mesh, gbuffer, camera = stage
     occlusion = scene.occlusion(mesh, gbuffer, camera, ray_count=1024)
     light = EnvironmentLight(radiance(directions(32)[0]))
-    way, solid_angle = (part.reshape(-1, *part.shape[2:]) for part in directions(96))
     state = relight.start(gbuffer, camera, [light], visibilities=[occlusion])
     for turn in (np.eye(3), TURN):
         state = state.edit(0, light.turned(turn))
-        weights = arrives(camera, gbuffer, way) * solid_angle
-        expected = np.asarray(gbuffer.diffuse).reshape(-1, 3) * (weights @ radiance(way @ turn))
-        error = np.asarray(state.image).reshape(-1, 3) - expected
+        expected = traced(gbuffer, camera, radiance, turn)
+        error = np.asarray(state.image) - expected
         found = 10 * np.log10(expected.max() ** 2 / np.mean(error**2))
         print(f"{radiance.__name__} {found:.1f} dB")
         assert found > least
