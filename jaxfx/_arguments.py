@@ -8,12 +8,25 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 import jax
+from jaxtyping import Array
 
-from jaxfx._checks import check_fields, check_shape, items
+from jaxfx._checks import (
+    as_array,
+    check_fields,
+    check_shape,
+    items,
+    parameter,
+    share,
+    shares,
+)
 from jaxfx.camera import Camera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.lens import FocusPlanes, Lens, ThinLens
-from jaxfx.light import Light
+from jaxfx.light import EnvironmentLight, Light, SphericalHarmonicsLight
+
+
+# How many numbers per pixel an occlusion may have: of degree 2 or 3.
+OCCLUSION_COUNTS = (9, 16)
 
 
 def check_camera(name: str, camera: Any, kind: Any = Camera) -> None:
@@ -60,10 +73,51 @@ def check_gbuffer(name: str, gbuffer: Any) -> GBuffer:
     return GBuffer(*jax.tree.leaves(gbuffer))
 
 
-def alike(lights: Sequence[Light]) -> list[list[int]]:
-    """The indices of lights that can be stacked: of one kind, with as many numbers."""
+def check_visibility(name: str, value: Any, light: Light, shape: tuple[int, ...]) -> Array:
+    """A light's visibility: a share of it per pixel or, of light from all around, `occlusion`'s
+    coefficients; `ValueError` names a wrong one."""
+    array = as_array(name, value)
+    if array.ndim != len(shape) + 1:
+        return share(name, value, shape)
+    if not isinstance(light, SphericalHarmonicsLight | EnvironmentLight):
+        raise ValueError(
+            f"`{name}` must have shape {shape} for a {type(light).__name__}, "
+            f"got {array.shape}: coefficients are for light from all around."
+        )
+    if array.shape not in {(*shape, count) for count in OCCLUSION_COUNTS}:
+        counts = " or ".join(map(str, OCCLUSION_COUNTS))
+        raise ValueError(
+            f"`{name}` must have shape {shape}, or that and {counts} coefficients, "
+            f"got {array.shape}."
+        )
+    return parameter(name, value, array.shape)
+
+
+def check_visibilities(
+    name: str, values: Any, lights: Sequence[Light], shape: tuple[int, ...]
+) -> list[Array | None]:
+    """One visibility, as by `check_visibility`, or None per light; None alone for all None."""
+    if values is not None:
+        values = items(name, values, "a sequence")
+    if values is None or len(values) != len(lights):
+        return shares(name, values, len(lights), shape)
+    return [
+        None if value is None else check_visibility(f"{name}[{index}]", value, light, shape)
+        for index, (value, light) in enumerate(zip(values, lights, strict=True))
+    ]
+
+
+def alike(
+    lights: Sequence[Light], visibilities: Sequence[Array | None] | None = None
+) -> list[list[int]]:
+    """The indices of lights that can be stacked: of one kind, with as many numbers.
+
+    So can their visibilities, where a visibility's pixel has as many numbers, or there is none.
+    """
     kinds, groups = get_args(Light), {}
     for index, light in enumerate(lights):
-        key = kinds.index(type(light)), getattr(light, "heights", ())
+        visibility = None if visibilities is None else visibilities[index]
+        numbers = () if visibility is None else visibility.shape[2:]
+        key = kinds.index(type(light)), getattr(light, "heights", ()), numbers
         groups.setdefault(key, []).append(index)
     return [groups[key] for key in sorted(groups)]

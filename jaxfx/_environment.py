@@ -5,12 +5,14 @@ at +x. So a texel's direction is (cos(b) sin(a), sin(b), -cos(b) cos(a)), a bein
 the right of the middle, b that above the horizon.
 
 A blur is for one roughness: the mean of the radiance about a direction, weighted by GGX's lobe
-as it is seen straight on. Directions of one row differ by a turn about y: so a blur is a
-product of matrices over rows and a convolution along them, which is a product after a Fourier
-transform.
+as it is seen straight on. That of roughness 1 is the cosine: the blur holds what a matt surface
+shows. Past 1 it passes over into the mean of a half sphere.
+
+Directions of one row differ by a turn about y: so a blur is a product of matrices over rows and
+a convolution along them, which is a product after a Fourier transform.
 
 Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001, the nine coefficients. Blurring
-by a Fourier transform along rows is our own.
+by a Fourier transform along rows, and the blurs past 1, are our own.
 """
 
 import functools
@@ -19,16 +21,18 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxfx._harmonics import FACTORS
 from jaxfx._numerics import safe_sqrt
 
 
 # The roughness of each level, and the most rows that it has, some two to a lobe's width. Level
-# 0 is the image. More rows take memory with their cube; fewer blur once more.
-ROUGHNESSES = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
-_MOST_ROWS = (128, 64, 64, 32, 32, 32, 32)
+# 0 is the image, the last a half sphere's mean. More rows take memory with their cube; fewer
+# blur once more.
+ROUGHNESSES = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 2.0)
+_MOST_ROWS = (128, 64, 64, 32, 32, 32, 32, 32)
+_COSINE = ROUGHNESSES.index(1.0)
 
 
 def heights(height: int) -> tuple[int, ...]:
@@ -60,7 +64,10 @@ def _lobes(height: int, roughness: float) -> Float[np.ndarray, "row row wave"]:
     between = sine[:, None, None] * sine[None, :, None]
     between = between + cosine[:, None, None] * cosine[None, :, None] * np.cos(turn)
     squared, alpha = (1 + np.clip(between, -1, 1)) / 2, roughness**2  # (N.H)**2
-    lobe = np.maximum(between, 0) / (squared * (alpha**2 - 1) + 1) ** 2
+    if roughness > 1:
+        lobe = (between > 0).astype(float)
+    else:
+        lobe = np.maximum(between, 0) / (squared * (alpha**2 - 1) + 1) ** 2
     lobe *= cosine[None, :, None]  # A texel's share of the sphere.
     lobe /= lobe.sum(axis=(1, 2), keepdims=True)
     return np.fft.rfft(lobe, axis=-1).real  # It is even.
@@ -91,7 +98,7 @@ def _means(size: int, to: int) -> Float[np.ndarray, "to size"]:
     return np.maximum(high - low, 0) * (to / size)
 
 
-def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
+def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "16 3"]:
     """The coefficients of `_harmonics`, in the image's axes."""
     height, width = image.shape[:2]
     # Means over texels, in which the radiance is even: by four nodes along each side.
@@ -100,13 +107,16 @@ def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
     mean = lambda values: values @ (weights / 2)
     angle = ((np.arange(width)[:, None] + inside) / width - 0.5) * 2 * np.pi
     s, c = np.sin(angle), np.cos(angle)
-    columns = [mean(value) for value in (1 + 0 * s, s, c, s * s, s * c, c * c)]
+    columns = [1 + 0 * s, s, c, s * s, s * c, c * c]
+    columns += [s * s * s, s * s * c, s * c * c, c * c * c]
+    columns = [mean(value) for value in columns]
     along = jnp.asarray(np.stack(columns), image.dtype)
     rows = jnp.einsum("kw,hwc->khc", along, image, precision="highest")
     above = (0.5 - (np.arange(height)[:, None] + inside) / height) * np.pi
     y, r = np.sin(above), np.cos(above)
     solid_angle = r * 2 * np.pi**2 / (height * width)
-    # 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy, as (row's factor, index of `along`).
+    # The polynomials of `_harmonics`, as (row's factor, index of `along`): y is constant along
+    # a row, x is r * s, z is -r * c.
     polynomials = [
         [(1 + 0 * y, 0)],
         [(y, 0)],
@@ -117,8 +127,15 @@ def coefficients(image: Float[Array, "height width 3"]) -> Float[Array, "9 3"]:
         [(3 * r * r, 5), (-1 + 0 * y, 0)],
         [(-r * r, 4)],
         [(r * r, 3), (-y * y, 0)],
+        [(3 * y * r**2, 3), (-(y**3), 0)],
+        [(-y * r**2, 4)],
+        [(5 * y * r**2, 5), (-y, 0)],
+        [(-5 * r**3, 9), (3 * r, 2)],
+        [(5 * r**3, 8), (-r, 1)],
+        [(-(r**3), 7), (r * y * y, 2)],
+        [(r**3, 6), (-3 * r * y * y, 1)],
     ]
-    factors = np.zeros((9, 6, height))
+    factors = np.zeros((16, len(columns), height))
     for k, terms in enumerate(polynomials):
         for factor, index in terms:
             factors[k, index] = mean(factor * solid_angle) * FACTORS[k]
@@ -133,33 +150,56 @@ def look_up(
     roughness: Float[Array, "height width"],
 ) -> Float[Array, "height width 3"]:
     """The blur of that roughness in these directions, linear between texels and levels."""
+    angles = _angles(direction)
+    steps = itertools.pairwise(ROUGHNESSES)
+    level = sum(jnp.clip((roughness - low) / (high - low), 0, 1) for low, high in steps)
+    first = jnp.clip(jnp.floor(level), 0, len(rows) - 2).astype(jnp.int32)
+    t = (level - first.astype(roughness.dtype))[..., None]
+    near = _texels(pyramid, rows, angles, first)
+    return (1 - t) * near + t * _texels(pyramid, rows, angles, first + 1)
+
+
+def irradiance(
+    pyramid: Float[Array, "texel 3"],
+    rows: tuple[int, ...],
+    normal: Float[Array, "height width 3"],
+) -> Float[Array, "height width 3"]:
+    """The colour of a white Lambert surface: the blur by the cosine, linear between texels."""
+    level = jnp.full(normal.shape[:2], _COSINE, jnp.int32)
+    return _texels(pyramid, rows, _angles(normal), level)
+
+
+def _angles(direction: Float[Array, "height width 3"]) -> tuple[Array, Array]:
+    """The angle to the right of the middle, and that above the horizon."""
     x, y, z = (direction[..., k] for k in range(3))
     across = x * x + z * z
     is_up = across == 0  # There an angle about the axis is no angle.
     right = jnp.where(is_up, 0, jnp.arctan2(jnp.where(is_up, 0, x), jnp.where(is_up, 1, -z)))
     above = jnp.arctan2(y, jnp.where(is_up, 1, safe_sqrt(across)))
-    above = jnp.where(is_up, jnp.sign(y) * (jnp.pi / 2), above)
-    steps = itertools.pairwise(ROUGHNESSES)
-    level = sum(jnp.clip((roughness - low) / (high - low), 0, 1) for low, high in steps)
-    first = jnp.clip(jnp.floor(level), 0, len(rows) - 2).astype(jnp.int32)
+    return right, jnp.where(is_up, jnp.sign(y) * (jnp.pi / 2), above)
+
+
+def _texels(
+    pyramid: Float[Array, "texel 3"],
+    rows: tuple[int, ...],
+    angles: tuple[Float[Array, "height width"], Float[Array, "height width"]],
+    level: Int[Array, "height width"],
+) -> Float[Array, "height width 3"]:
+    """A level at these angles, linear between texels."""
+    right, above = angles
     starts = np.cumsum([0, *(2 * height * height for height in rows)])[:-1]
+    height = jnp.asarray(rows, jnp.int32)[level]
+    size, start = height.astype(right.dtype), jnp.asarray(starts, jnp.int32)[level]
+    column = (right / (2 * jnp.pi) + 0.5) * 2 * size - 0.5
+    row = jnp.clip((0.5 - above / jnp.pi) * size - 0.5, 0, size - 1)
+    left, top = jnp.floor(column), jnp.floor(row)
+    s, t = (column - left)[..., None], (row - top)[..., None]
+    left, top = left.astype(jnp.int32), top.astype(jnp.int32)
+    below = jnp.minimum(top + 1, height - 1)
 
-    def texels(index):
-        height = jnp.asarray(rows, jnp.int32)[index]
-        size, start = height.astype(x.dtype), jnp.asarray(starts, jnp.int32)[index]
-        column = (right / (2 * jnp.pi) + 0.5) * 2 * size - 0.5
-        row = jnp.clip((0.5 - above / jnp.pi) * size - 0.5, 0, size - 1)
-        left, top = jnp.floor(column), jnp.floor(row)
-        s, t = (column - left)[..., None], (row - top)[..., None]
-        left, top = left.astype(jnp.int32), top.astype(jnp.int32)
-        below = jnp.minimum(top + 1, height - 1)
+    def at(row, column):
+        flat = start + row * (2 * height) + column % (2 * height)
+        return pyramid.at[flat].get(mode="clip")
 
-        def at(row, column):
-            flat = start + row * (2 * height) + column % (2 * height)
-            return pyramid.at[flat].get(mode="clip")
-
-        upper = (1 - s) * at(top, left) + s * at(top, left + 1)
-        return (1 - t) * upper + t * ((1 - s) * at(below, left) + s * at(below, left + 1))
-
-    t = (level - first.astype(x.dtype))[..., None]
-    return (1 - t) * texels(first) + t * texels(first + 1)
+    upper = (1 - s) * at(top, left) + s * at(top, left + 1)
+    return (1 - t) * upper + t * ((1 - s) * at(below, left) + s * at(below, left + 1))

@@ -26,7 +26,7 @@ class GBuffer(eqx.Module):
 
     - `color`: height width 3, base colour of the surface, linear RGB.
     - `shader`: height width, integers: -1 nothing, 0 Lambert, 1 Phong, 2 Blinn, 3 GGX (glTF's
-      metallic-roughness: `GBuffer.metallic_roughness` makes one).
+      metallic-roughness: `GBuffer.metallic_roughness` makes one), 4 GGX that conserves energy.
     - `ambient`, `diffuse`, `specular`: height width 3, the linear RGB reflectances that
       ambient, diffuse and specular light are multiplied by (they include the base colour). Of
       GGX, `specular` is the reflectance straight on.

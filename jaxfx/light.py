@@ -249,8 +249,8 @@ class SphericalHarmonicsLight(eqx.Module):
 class EnvironmentLight(eqx.Module):
     """The surroundings, from an image of all directions: a sky, a room, a panorama.
 
-    Matt surfaces get nine spherical harmonics of it, GGX surfaces highlights from blurs of it
-    as well. Both are made once, here: to turn the surroundings (`turned`) costs nothing.
+    Matt surfaces get a blur of it by the cosine, GGX surfaces highlights from blurs by their
+    lobe as well. All are made once, here: to turn the surroundings (`turned`) costs nothing.
 
     **Arguments:**
 
@@ -265,8 +265,8 @@ class EnvironmentLight(eqx.Module):
     `world_from_image` that is no rotation to 1e-3.
 
     **Gradient:** exact, through both approximations, with respect to `image`,
-    `world_from_image` and `color`. It jumps where a mirrored direction passes from texel to
-    texel.
+    `world_from_image` and `color`. It jumps where a normal or a mirrored direction passes from
+    texel to texel.
 
     **Example:** bright above, dark below:
 
@@ -275,23 +275,25 @@ class EnvironmentLight(eqx.Module):
     >>> sky = np.ones((16, 32, 3)) * np.linspace(1, 0, 16)[:, None, None]
     >>> light = EnvironmentLight(sky)
     >>> light.coefficients.shape, light.heights[:2]
-    ((9, 3), (16, 16))
+    ((16, 3), (16, 16))
 
-    - `coefficients`: 9 3, as in `SphericalHarmonicsLight`, in the image's axes.
+    - `coefficients`: 16 3, in the image's axes; the first nine as in `SphericalHarmonicsLight`,
+      then y(3xx - yy), xyz, y(5zz - 1), z(5zz - 3), x(5zz - 1), z(xx - yy), x(xx - 3yy).
+      Shadows from all around (`scene.occlusion`) read them, nothing else.
     - `pyramid`, `heights`: the texels of all blurs, and how many rows each has.
 
-    The split sum takes a highlight for round, and as seen straight on: at grazing angles a true
-    one is drawn out. Lambert, Phong and Blinn surfaces get diffuse light alone. Shadows are
-    given, as any light's: one number for all directions.
+    A highlight is the split sum of two round lobes: at grazing angles a true one is drawn out.
+    Lambert, Phong and Blinn surfaces get diffuse light alone. A visibility of height width is
+    one number for all directions; that of `scene.occlusion` tells them apart.
 
-    Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001.
+    Source: Karis 2013, the split sum; Ramamoorthi & Hanrahan 2001. The second lobe is our own.
     """
 
-    SHAPES: ClassVar = {"color": (3,), "world_from_image": (3, 3), "coefficients": (9, 3)}
+    SHAPES: ClassVar = {"color": (3,), "world_from_image": (3, 3), "coefficients": (16, 3)}
 
     color: Float[Array, "3"]
     world_from_image: Float[Array, "3 3"]
-    coefficients: Float[Array, "9 3"]
+    coefficients: Float[Array, "16 3"]
     pyramid: Float[Array, "texel 3"]
     heights: tuple[int, ...] = eqx.field(static=True)
 

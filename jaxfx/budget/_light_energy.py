@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxfx.budget._tiles import tile_of, tile_sums
 from jaxfx.light import Light
-from jaxfx.relight.shading import Surface, has_ggx, reflected, to_surface
+from jaxfx.relight.shading import Surface, ggx_kinds, reflected, to_surface
 
 
 # The share of the error that left-out shadows may take, a ratio: the rest is for lights. A
@@ -51,7 +51,7 @@ def light_energy(gbuffer: Any, camera: Any, lights: Any, visibilities: Any) -> E
     shadows = {}
     for members in by_kind(lights, visibilities):
         some = [(lights[n], visibilities[n]) for n in members]
-        squares = np.asarray(_squares(gbuffer, camera, some, has_ggx(gbuffer)), float)
+        squares = np.asarray(_squares(gbuffer, camera, some, ggx_kinds(gbuffer)), float)
         unshadowed[:, members], energy[:, members] = squares[0].T, squares[1].T
         if visibilities[members[0]] is not None:
             taken = np.sqrt(squares[2].sum(axis=1) / size)
@@ -80,10 +80,10 @@ def stacked(some: Sequence[Any], surface: Surface) -> tuple[Any, Any]:
     return lights, jnp.where((surface.shader < 0)[None], 0, shadows)
 
 
-@partial(jax.jit, static_argnames="with_ggx")
-def _squares(gbuffer, camera, some, with_ggx):
+@partial(jax.jit, static_argnames="kinds")
+def _squares(gbuffer, camera, some, kinds):
     """Sums of squares, light tile: without its shadow, with it, and of what that takes."""
-    surface = to_surface(gbuffer, camera, with_ggx)
+    surface = to_surface(gbuffer, camera, kinds)
 
     def each(both):
         light, shadow = both

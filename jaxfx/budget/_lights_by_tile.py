@@ -14,7 +14,7 @@ from jaxfx._loops import scan
 from jaxfx.budget._light_energy import Energy, by_kind, stacked
 from jaxfx.budget._search import Search, Trial
 from jaxfx.budget._tiles import Blocks, blocks, spend, tile_of
-from jaxfx.relight.shading import has_ggx, reflected, to_surface
+from jaxfx.relight.shading import ggx_kinds, reflected, to_surface
 
 
 # A share of the tiles. A light that is needed in more of them than this is computed in all
@@ -43,7 +43,7 @@ class Tiled(eqx.Module):
         read = {n: as_array(name, visibilities[n]) for n in self.shadowed}
         chosen = lambda members: [(lights[n], read.get(n)) for n in members]
         parts = [(chosen(part.members), part.item, part.pixels) for part in self.parts]
-        return _tiled(gbuffer, camera, chosen(self.everywhere), parts, has_ggx(gbuffer))
+        return _tiled(gbuffer, camera, chosen(self.everywhere), parts, ggx_kinds(gbuffer))
 
 
 def try_tiles(search: Search, brought: Energy) -> None:
@@ -94,10 +94,10 @@ def _named(kind: str, indices: Sequence[Any]) -> str:
     return f"{kind}{'s' if len(indices) > 1 else ''} {numbers}"
 
 
-@partial(jax.jit, static_argnames="with_ggx")
-def _tiled(gbuffer, camera, everywhere, parts, with_ggx):
+@partial(jax.jit, static_argnames="kinds")
+def _tiled(gbuffer, camera, everywhere, parts, kinds):
     """The image of lights and their shadows everywhere, and of those in blocks of pixels."""
-    surface = to_surface(gbuffer, camera, with_ggx)
+    surface = to_surface(gbuffer, camera, kinds)
     image = jnp.zeros_like(surface.position)
     recomputed = jax.checkpoint(reflected, prevent_cse=False)
 

@@ -17,8 +17,8 @@ from jaxfx._loops import scan
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight.shading import (
     Surface,
+    in_shadow,
     received,
-    shadowed,
     stack_visibilities,
     with_reflectances,
 )
@@ -64,7 +64,7 @@ def with_lights(surface, sums, lights, visibilities, signs):
 
     One loop for each kind of light; ambient lights have no term.
     """
-    for which in alike(lights):
+    for which in alike(lights, visibilities):
         if isinstance(lights[which[0]], AmbientLight):
             continue
         group = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lights[i] for i in which))
@@ -78,16 +78,13 @@ def _with_term(
     surface: Surface,
     sums: Sums,
     light: Light,
-    visibility: Float[Array, "height width"] | None,
+    visibility: Float[Array, "height width ..."] | None,
     sign: Float[Array, ""],
 ) -> Sums:
     """The sums with one light's term times `sign`."""
     terms = jax.checkpoint(received, prevent_cse=False)(surface, light)
-    terms = {
-        index: shadowed(surface, term, visibility)
-        for index, term in enumerate(terms)
-        if term is not None
-    }
+    terms = in_shadow(surface, light, terms, visibility)
+    terms = {index: term for index, term in enumerate(terms) if term is not None}
     # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once, with
     # a third less work; that of 0.10 drops the barrier and computes them again for each.
     terms = jax.lax.optimization_barrier(terms)

@@ -140,4 +140,5 @@ def _as_surface(transfer: Transfer) -> Surface:
         specular=zero,
         exponent=jnp.zeros_like(one_row),
         facing=None,
+        returned=None,
     )

@@ -161,7 +161,7 @@ def _index(function: str, index: Any, gbuffer: GBuffer) -> Float[Array, "#height
 
 @jax.jit
 def _mirrored(gbuffer, camera):
-    surface = to_surface(gbuffer, camera, with_ggx=True)
+    surface = to_surface(gbuffer, camera, kinds=1)
     facing = _facing(surface)[..., None]
     directions = 2 * facing * surface.normal - surface.to_camera
     return _rays(gbuffer, surface, directions, jnp.ones(facing.shape, bool))
@@ -169,7 +169,7 @@ def _mirrored(gbuffer, camera):
 
 @jax.jit
 def _refracted(gbuffer, camera, index):
-    surface = to_surface(gbuffer, camera, with_ggx=True)
+    surface = to_surface(gbuffer, camera, kinds=1)
     index = index.astype(surface.position.dtype)
     facing = _facing(surface)
     cosine, passes = _behind(facing, index)
@@ -203,7 +203,7 @@ def _behind(facing: Array, index: Array) -> tuple[Array, Array]:
 
 @jax.jit
 def _fresnel(gbuffer, camera, index):
-    surface = to_surface(gbuffer, camera, with_ggx=True)
+    surface = to_surface(gbuffer, camera, kinds=1)
     facing = absolute(_facing(surface))
     if index is None:
         grazing = (1 - clip01(facing)) ** 5

@@ -3,7 +3,7 @@
 At a pixel, a light is described by the direction towards it and its irradiance; a shader by the
 two unit vectors whose cosine, raised to a power, is its highlight, or by the lobe of `_ggx`.
 Everything is elementwise over pixels. `jaxfx.budget` uses `Surface`, `to_surface`, `reflected`,
-`has_ggx` and `check_shader`.
+`ggx_kinds` and `check_shader`.
 
 Cosines near 1 are computed as `1 - cosine`, half the squared distance between unit vectors, so
 that sharp highlights and narrow cones lose no digits and no cosine exceeds 1.
@@ -19,10 +19,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx import _environment
-from jaxfx._arguments import alike, check_camera, check_gbuffer, check_light, check_lights
+from jaxfx._arguments import (
+    alike,
+    check_camera,
+    check_gbuffer,
+    check_light,
+    check_lights,
+    check_visibilities,
+    check_visibility,
+)
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import check, is_concrete, parameter, share, shares
-from jaxfx._harmonics import irradiance as harmonic_irradiance
+from jaxfx._checks import check, is_concrete, parameter
+from jaxfx._harmonics import FACTORS, irradiance as harmonic_irradiance, turned
 from jaxfx._loops import scan
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import clip01, normalize, safe_divide, working_dtype
@@ -45,7 +53,7 @@ from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing, mean_lobe, roughn
 _Vectors = Float[Array, "height width 3"]
 _Scalars = Float[Array, "height width"]
 # Numbers of shaders in a G-buffer; 0, Lambert, has no highlight; 2 is Blinn.
-_NOTHING, _PHONG, _GGX = -1, 1, 3
+_NOTHING, _PHONG, _GGX, _CONSERVING = -1, 1, 3, 4
 # Length of a vector: scene units, of those to lights. A shorter vector is divided by this in
 # place of its length, and so fades to zero. Smaller values let float32's second derivatives
 # overflow next to a light.
@@ -65,6 +73,7 @@ def shade(
     light: Light,
     visibility: Float[ArrayLike, "height width"]
     | Bool[ArrayLike, "height width"]
+    | Float[ArrayLike, "height width coefficient"]
     | None = None,
 ) -> Float[Array, "height width 3"]:
     """The image under one light.
@@ -77,7 +86,9 @@ def shade(
       rays, of a cache from `scene.gbuffer_along`.
     - `light`: of any kind.
     - `visibility`: height width, in [0, 1] or booleans: the share of the light that arrives,
-      from a filter of `jaxfx.shadow` for instance. Left out, all of it arrives.
+      from a filter of `jaxfx.shadow` for instance. Left out, all of it arrives. Of a
+      `SphericalHarmonicsLight` or `EnvironmentLight` also that of `scene.occlusion`, height
+      width coefficient, which tells directions apart.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`. Exactly 0 where the
     shader is -1, the depth inf or missing (0, negative, NaN). A NaN elsewhere stays in its
@@ -85,7 +96,7 @@ def shade(
     nearer to the surface than 1e-5 scene units fades out.
 
     **Raises:** `ValueError` for a wrong shape, an unknown light or shader, or a visibility
-    outside [0, 1]. Traced values are not checked: any shader but 0 to 3 is black, and any
+    outside [0, 1]. Traced values are not checked: any shader but 0 to 4 is black, and any
     visibility multiplies.
 
     **Gradient:** exact, forward and reverse, with respect to the light, the camera,
@@ -119,6 +130,8 @@ def shade(
     `GBuffer.metallic_roughness` makes both. What it reflects of a light from everywhere is at
     most that light for a metal. glTF's mix of the two parts gives a dielectric more where it is
     seen at a grazing angle: a white one 1.03 at 30 degrees, 1.5 at 6 degrees, if it is smooth.
+    Shader 4 never does: it has the same lobe, and its diffuse part is `E * (1 - R) * diffuse *
+    N.L`, where R is what the lobe returns, times F, of white light from everywhere.
 
     E is the light's colour, over the squared distance for point and spot lights. A spot light's
     is also multiplied by `s * s * (3 - 2 * s)`, where s rises linearly in the cosine of the
@@ -126,12 +139,14 @@ def shade(
 
     Source: Pellacini et al. 2005 (Lpics); Kim, Lee & Kyung, deep-frame-buffer relighting;
     the models are those of Phong 1975, Blinn 1977 and glTF 2.0 (Khronos 2017), appendix B.3.
+    That shader 4 gives the diffuse part what the highlight leaves is Kulla & Conty 2017's.
     """
     gbuffer = check_cache("shade", gbuffer, camera)
     check_light("shade(light)", light)
     if visibility is not None:
-        visibility = share("shade(visibility)", visibility, gbuffer.depth.shape)
-    return _shade(gbuffer, camera, light, visibility, has_ggx(gbuffer))
+        shape = gbuffer.depth.shape
+        visibility = check_visibility("shade(visibility)", visibility, light, shape)
+    return _shade(gbuffer, camera, light, visibility, ggx_kinds(gbuffer))
 
 
 @on_any_mesh
@@ -150,8 +165,8 @@ def render(
 
     - `gbuffer`, `camera`: as in `shade`.
     - `lights`: a sequence of lights of any kinds. None give a black image.
-    - `visibilities`: one per light: height width in [0, 1], or None where it has no shadows.
-      None alone stands for no shadows at all.
+    - `visibilities`: one per light: as in `shade`, or None where it has no shadows. None alone
+      stands for no shadows at all.
 
     **Returns:** height width 3, linear RGB, in the type of `gbuffer.color`.
 
@@ -178,8 +193,8 @@ def render(
     lights = check_lights("render(lights)", lights)
     gbuffer = check_cache("render", gbuffer, camera)
     name, shape = "render(visibilities=...)", gbuffer.depth.shape
-    visible = tuple(shares(name, visibilities, len(lights), shape))
-    return _render(gbuffer, camera, lights, visible, has_ggx(gbuffer))
+    visible = tuple(check_visibilities(name, visibilities, lights, shape))
+    return _render(gbuffer, camera, lights, visible, ggx_kinds(gbuffer))
 
 
 class Surface(NamedTuple):
@@ -187,7 +202,8 @@ class Surface(NamedTuple):
 
     `normal` and `to_camera` are unit vectors in world space; the three reflectances are linear
     RGB; `exponent` is that of the highlight. `facing` is N.V, which GGX reads, or None where no
-    pixel can have that shader: a program then has nothing of it.
+    pixel can have that shader: a program then has nothing of it. Likewise `returned`, which
+    GGX that conserves energy reads: of `response`.
     """
 
     shader: Int[Array, "height width"]
@@ -199,22 +215,34 @@ class Surface(NamedTuple):
     specular: _Vectors
     exponent: _Scalars
     facing: _Scalars | None
+    returned: Float[Array, "height width 2"] | None
 
 
-def has_ggx(gbuffer: GBuffer) -> bool:
-    """Whether a pixel of a cache has the shader GGX, or may have it: where it is traced."""
-    return not is_concrete(gbuffer.shader) or bool((np.asarray(gbuffer.shader) == _GGX).any())
+def ggx_kinds(gbuffer: GBuffer) -> int:
+    """What a pixel of a cache has, or may have where it is traced: 0 no GGX, 1 glTF's, 2 that
+    which conserves energy too."""
+    if not is_concrete(gbuffer.shader):
+        return 2
+    shader = np.asarray(gbuffer.shader)
+    return 2 if (shader == _CONSERVING).any() else int((shader == _GGX).any())
 
 
-def to_surface(gbuffer: GBuffer, camera: Camera | Rays, with_ggx: bool) -> Surface:
+def response(facing: _Scalars, exponents: _Scalars) -> Float[Array, "height width 2"]:
+    """What a highlight returns of white light from everywhere, by N.V: a share that `specular`
+    multiplies, and one besides."""
+    lobe = mean_lobe(facing, jnp.sqrt(roughness_squared(exponents)))
+    return jnp.stack([lobe.specular, lobe.grazing], axis=-1)
+
+
+def to_surface(gbuffer: GBuffer, camera: Camera | Rays, kinds: int) -> Surface:
     """The surface of a cache; where there is none, shader -1 and finite stand-ins.
 
-    `with_ggx` is static: `has_ggx` of the cache.
+    `kinds` is static: `ggx_kinds` of the cache.
     """
     dtype = working_dtype(gbuffer.color.dtype)
     shader = gbuffer.shader.astype(jnp.int32)
     has_depth = (gbuffer.depth > 0) & (gbuffer.depth != jnp.inf)
-    is_surface = (shader > _NOTHING) & (shader <= _GGX) & has_depth
+    is_surface = (shader > _NOTHING) & (shader <= _CONSERVING) & has_depth
     is_shiny = is_surface & (shader >= _PHONG)
 
     def masked(field: Array, stand_in: int, mask: Array = is_surface) -> Array:
@@ -231,6 +259,8 @@ def to_surface(gbuffer: GBuffer, camera: Camera | Rays, with_ggx: bool) -> Surfa
         # At depth 0 lies the eye, or the start of an orthographic ray.
         to_camera = camera.unproject(pixels, jnp.zeros_like(depth)) - position
     normal, to_camera = _unit(masked(gbuffer.normal, 0)), _unit(to_camera)
+    facing = _dot(normal, to_camera) if kinds else None
+    exponents = exponent(masked(gbuffer.roughness, 1, is_shiny))
     return Surface(
         shader=jnp.where(is_surface, shader, _NOTHING),
         position=position,
@@ -239,8 +269,9 @@ def to_surface(gbuffer: GBuffer, camera: Camera | Rays, with_ggx: bool) -> Surfa
         ambient=masked(gbuffer.ambient, 0),
         diffuse=masked(gbuffer.diffuse, 0),
         specular=masked(gbuffer.specular, 0, is_shiny),
-        exponent=exponent(masked(gbuffer.roughness, 1, is_shiny)),
-        facing=_dot(normal, to_camera) if with_ggx else None,
+        exponent=exponents,
+        facing=facing,
+        returned=response(facing, exponents) if facing is not None and kinds == 2 else None,
     )
 
 
@@ -266,8 +297,13 @@ def with_reflectances(
     """The radiance that the surface reflects, from the three parts of the light it receives."""
     matte = surface.diffuse
     if surface.facing is not None:
-        is_ggx = (surface.shader == _GGX)[..., None]
-        matte = matte * jnp.where(is_ggx, 1 - surface.specular, 1)
+        is_gltf = (surface.shader == _GGX)[..., None]
+        kept = jnp.where(is_gltf, 1 - surface.specular, 1)
+        if surface.returned is not None:
+            is_conserving = (surface.shader == _CONSERVING)[..., None]
+            share, besides = surface.returned[..., :1], surface.returned[..., 1:]
+            kept = jnp.where(is_conserving, 1 - surface.specular * share - besides, kept)
+        matte = matte * kept
     image = matte * diffuse
     if specular is not None:
         image = image + surface.specular * specular
@@ -290,7 +326,8 @@ def received(
     """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
     if isinstance(light, SphericalHarmonicsLight):
-        return _from_around(surface, surface.normal, light.coefficients), None, None
+        irradiance = harmonic_irradiance(surface.normal, light.coefficients)
+        return _on_matt(surface, irradiance), None, None
     if isinstance(light, EnvironmentLight):
         return _from_surroundings(surface, light)
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
@@ -300,7 +337,7 @@ def received(
     highlight = _highlight(surface, to_light, halfway, cosine)
     if surface.facing is None:
         return diffuse, irradiance * highlight[..., None], None
-    is_ggx = surface.shader == _GGX
+    is_ggx = surface.shader >= _GGX
     is_dark = (cosine <= 0) | (_dot(surface.normal, halfway) <= 0)
     lobe, grazing = lobe_and_fresnel(
         is_ggx & ~is_dark,
@@ -312,22 +349,18 @@ def received(
     )
     specular = irradiance * jnp.where(is_ggx, lobe, highlight)[..., None]
     grazing = grazing[..., None]
-    return (1 - grazing) * diffuse, (1 - grazing) * specular, grazing * specular
+    # Of GGX that conserves energy, `with_reflectances` takes the highlight's share instead.
+    mixed = jnp.where((surface.shader == _CONSERVING)[..., None], 0, grazing)
+    return (1 - mixed) * diffuse, (1 - grazing) * specular, grazing * specular
 
 
-def _from_around(
-    surface: Surface, normal: _Vectors, coefficients: Float[Array, "9 3"]
-) -> _Vectors:
-    """The diffuse light of a radiance with these coefficients; none where a normal is zero.
-
-    `normal` is in the axes of the coefficients.
-    """
-    diffuse = harmonic_irradiance(normal, coefficients)
+def _on_matt(surface: Surface, irradiance: _Vectors) -> _Vectors:
+    """The diffuse light, of an irradiance from all around; none where a normal is zero."""
     has_normal = _dot(surface.normal, surface.normal) != 0
     if surface.facing is not None:
-        is_ggx = surface.shader == _GGX
-        diffuse *= jnp.where(is_ggx, 1 - mean_grazing(surface.facing), 1)[..., None]
-    return jnp.where(has_normal[..., None], diffuse, 0)
+        is_gltf = surface.shader == _GGX
+        irradiance *= jnp.where(is_gltf, 1 - mean_grazing(surface.facing), 1)[..., None]
+    return jnp.where(has_normal[..., None], irradiance, 0)
 
 
 def _from_surroundings(
@@ -336,17 +369,18 @@ def _from_surroundings(
     """The three parts of the light of an image of all directions."""
     column = lambda k: jnp.broadcast_to(light.world_from_image[:, k], surface.normal.shape)
     turned = lambda way: jnp.stack([_dot(way, column(k)) for k in range(3)], axis=-1)
-    color = light.color[None, None]
-    diffuse = color * _from_around(surface, turned(surface.normal), light.coefficients)
+    color, blurs = light.color[None, None], (light.pyramid, light.heights)
+    irradiance = _environment.irradiance(*blurs, turned(surface.normal))
+    diffuse = color * _on_matt(surface, irradiance)
     if surface.facing is None:
         return diffuse, None, None
     mirrored = 2 * surface.facing[..., None] * surface.normal - surface.to_camera
     lobe = mean_lobe(surface.facing, jnp.sqrt(roughness_squared(surface.exponent)))
     toward = surface.normal + lobe.mirrored[..., None] * (mirrored - surface.normal)
-    reflected = _environment.look_up(
-        light.pyramid, light.heights, turned(toward), lobe.roughness
-    )
-    is_ggx = (surface.shader == _GGX) & (_dot(surface.normal, surface.normal) != 0)
+    rest = _environment.look_up(*blurs, turned(toward), lobe.roughness)
+    matt = lobe.matt[..., None]
+    reflected = matt * irradiance + (1 - matt) * rest
+    is_ggx = (surface.shader >= _GGX) & (_dot(surface.normal, surface.normal) != 0)
     specular, grazing = (
         jnp.where(is_ggx[..., None], color * reflected * mean[..., None], 0)
         for mean in (lobe.specular, lobe.grazing)
@@ -426,15 +460,15 @@ def check_cache(function: str, gbuffer: Any, camera: Any) -> GBuffer:
 
 
 def check_shader(gbuffer: GBuffer) -> GBuffer:
-    """The cache; `ValueError` where a concrete shader is none of -1, 0, 1, 2 and 3."""
-    is_known = lambda v: (v >= _NOTHING) & (v <= _GGX)
-    check("GBuffer(shader)", gbuffer.shader, is_known, "-1, 0, 1, 2 or 3")
+    """The cache; `ValueError` where a concrete shader is none of -1, 0, 1, 2, 3 and 4."""
+    is_known = lambda v: (v >= _NOTHING) & (v <= _CONSERVING)
+    check("GBuffer(shader)", gbuffer.shader, is_known, "-1, 0, 1, 2, 3 or 4")
     return gbuffer
 
 
 def stack_visibilities(
-    visibilities: Sequence[_Scalars | None], surface: Surface
-) -> Float[Array, "light height width"] | None:
+    visibilities: Sequence[Float[Array, "height width ..."] | None], surface: Surface
+) -> Float[Array, "light height width ..."] | None:
     """The lights' visibilities as one array, 1 for a light without; None if all are without."""
     if all(visible is None for visible in visibilities):
         return None
@@ -452,19 +486,73 @@ def shadowed(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> 
     return visibility[..., None] * image
 
 
-@partial(jax.jit, static_argnames="with_ggx")
-def _shade(gbuffer, camera, light, visibility, with_ggx):
-    surface = to_surface(gbuffer, camera, with_ggx)
-    image = shadowed(surface, reflected(surface, light), visibility)
-    return image.astype(gbuffer.color.dtype)
+def in_shadow(
+    surface: Surface,
+    light: Any,
+    terms: tuple[_Vectors, _Vectors | None, _Vectors | None],
+    visibility: Float[Array, "height width ..."] | None,
+) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
+    """The terms of `received` in the light's shadow.
+
+    Where the visibility has coefficients, the diffuse light is their sum with the light's, and
+    highlights are as bright as that is under a white sky.
+    """
+    diffuse, *highlights = terms
+    if visibility is not None and visibility.ndim == 3:
+        visibility = visibility.astype(surface.position.dtype)
+        diffuse = _on_matt(surface, _by_coefficient(light, visibility))
+        visibility = visibility[..., 0] / float(FACTORS[0])
+        diffuse = jnp.where((surface.shader == _NOTHING)[..., None], 0, diffuse)
+    else:
+        diffuse = shadowed(surface, diffuse, visibility)
+    specular, grazing = (
+        None if term is None else shadowed(surface, term, visibility) for term in highlights
+    )
+    return diffuse, specular, grazing
 
 
-@partial(jax.jit, static_argnames="with_ggx")
-def _render(gbuffer, camera, lights, visibilities, with_ggx):
-    surface = to_surface(gbuffer, camera, with_ggx)
+def _by_coefficient(
+    light: SphericalHarmonicsLight | EnvironmentLight,
+    visibility: Float[Array, "height width coefficient"],
+) -> _Vectors:
+    """What a white Lambert surface shows of light from all around, by `scene.occlusion`."""
+    coefficients = light.coefficients.astype(visibility.dtype)
+    if isinstance(light, EnvironmentLight):
+        turn = light.world_from_image.astype(visibility.dtype)
+        color = light.color.astype(visibility.dtype)[None]
+        coefficients = turned(coefficients * color, turn)
+    count = min(visibility.shape[-1], len(coefficients))
+    product = jnp.matmul(
+        visibility[..., :count].reshape(-1, count), coefficients[:count], precision="highest"
+    )
+    return product.reshape(*visibility.shape[:2], 3)
+
+
+def lit(
+    surface: Surface,
+    light: Light,
+    visibility: Float[Array, "height width ..."] | None,
+) -> _Vectors:
+    """The image under one light in its shadow."""
+    if visibility is None or visibility.ndim == 2 or isinstance(light, AmbientLight):
+        return shadowed(surface, reflected(surface, light), visibility)
+    terms = in_shadow(surface, light, received(surface, light), visibility)
+    image = with_reflectances(surface, *terms)
+    return jnp.where((surface.shader == _NOTHING)[..., None], 0, image)
+
+
+@partial(jax.jit, static_argnames="kinds")
+def _shade(gbuffer, camera, light, visibility, kinds):
+    surface = to_surface(gbuffer, camera, kinds)
+    return lit(surface, light, visibility).astype(gbuffer.color.dtype)
+
+
+@partial(jax.jit, static_argnames="kinds")
+def _render(gbuffer, camera, lights, visibilities, kinds):
+    surface = to_surface(gbuffer, camera, kinds)
     image = jnp.zeros_like(surface.position)
     stack = lambda *leaves: jnp.stack([leaf.astype(image.dtype) for leaf in leaves])
-    for which in alike(lights):
+    for which in alike(lights, visibilities):
         group = jax.tree.map(stack, *(lights[i] for i in which))
         shadows = stack_visibilities([visibilities[i] for i in which], surface)
         terms = surface, image, (group, shadows)
@@ -472,7 +560,7 @@ def _render(gbuffer, camera, lights, visibilities, with_ggx):
     return image.astype(gbuffer.color.dtype)
 
 
-_again = jax.checkpoint(reflected, prevent_cse=False)
+_lit_again = jax.checkpoint(lit, prevent_cse=False)
 
 
 def _one_by_one(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
@@ -483,7 +571,7 @@ def _one_by_one(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
 
     def add(image, term):
         light, visibility = term
-        return image + shadowed(surface, _again(surface, light), visibility), None
+        return image + _lit_again(surface, light, visibility), None
 
     return scan(add, image, terms)[0]
 
@@ -493,7 +581,7 @@ def _together(surface: Surface, image: _Vectors, terms: Any) -> _Vectors:
 
     @partial(jax.checkpoint, prevent_cse=False)
     def add(image, group):
-        one = lambda term: shadowed(surface, reflected(surface, term[0]), term[1])
+        one = lambda term: lit(surface, *term)
         return image + jnp.sum(jax.vmap(one)(group), axis=0), None
 
     count = len(jax.tree.leaves(terms)[0])

@@ -14,20 +14,32 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._arguments import check_light, check_lights
+from jaxfx._arguments import (
+    check_light,
+    check_lights,
+    check_visibilities,
+    check_visibility,
+)
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import as_array, parameter, share, shares, whole_number
+from jaxfx._checks import as_array, parameter, share, whole_number
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
 from jaxfx.camera import OrthographicCamera, PinholeCamera, Rays
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight._sums import Sums, image_of, sums_of_none, with_lights
-from jaxfx.relight.shading import Surface, check_cache, exponent, has_ggx, to_surface
+from jaxfx.relight.shading import (
+    Surface,
+    check_cache,
+    exponent,
+    ggx_kinds,
+    response,
+    to_surface,
+)
 
 
 _Image = Float[Array, "height width 3"]
-_Visibility = Float[Array, "height width"]
+_Visibility = Float[Array, "height width ..."]
 
 _to_surface = jax.jit(to_surface, static_argnums=2)
 
@@ -48,8 +60,8 @@ def start(
 
     - `gbuffer`, `camera`: as in `shade`.
     - `lights`: a sequence of lights of any kinds; without any, the image is black.
-    - `visibilities`: one per light: height width in [0, 1], or None where it has no shadows.
-      None alone stands for no shadows at all.
+    - `visibilities`: one per light: as in `shade`, or None where it has no shadows. None alone
+      stands for no shadows at all.
 
     **Returns:** the `RelightState`.
 
@@ -79,8 +91,8 @@ def start(
     lights = check_lights("start(lights)", lights)
     gbuffer = check_cache("start", gbuffer, camera)
     name, shape = "start(visibilities=...)", gbuffer.depth.shape
-    visibilities = shares(name, visibilities, len(lights), shape)
-    surface = _to_surface(gbuffer, camera, has_ggx(gbuffer))
+    visibilities = check_visibilities(name, visibilities, lights, shape)
+    surface = _to_surface(gbuffer, camera, ggx_kinds(gbuffer))
     empty = RelightState(
         color=gbuffer.color.astype(surface.position.dtype),
         surface=surface,
@@ -102,7 +114,8 @@ class RelightState(eqx.Module):
     - `color`: height width 3, the surface's base colour, linear RGB.
     - `surface`: the visible surface, height width; positions in scene units.
     - `lights`: the lights.
-    - `visibilities`: one per light: height width in [0, 1], or None.
+    - `visibilities`: one per light: height width in [0, 1], or height width coefficient of
+      light from all around, or None.
     - `sums`: the lights' sums per pixel; private.
     - `dtype`: static; the type of `image`.
     """
@@ -134,6 +147,7 @@ class RelightState(eqx.Module):
         light: Light,
         visibility: Float[ArrayLike, "height width"]
         | Bool[ArrayLike, "height width"]
+        | Float[ArrayLike, "height width coefficient"]
         | Literal["kept"]
         | None = "kept",
     ) -> "RelightState":
@@ -147,8 +161,8 @@ class RelightState(eqx.Module):
 
         - `i`: static; the light's index, from 0.
         - `light`: the new light, of any kind.
-        - `visibility`: height width, in [0, 1], of the new light; None for no shadows. Left
-          out, it is that of the old light.
+        - `visibility`: of the new light, as in `shade`; None for no shadows. Left out, it is
+          that of the old light: to turn an `EnvironmentLight` keeps its occlusion.
 
         **Returns:** the new `RelightState`.
 
@@ -175,6 +189,7 @@ class RelightState(eqx.Module):
         light: Light,
         visibility: Float[ArrayLike, "height width"]
         | Bool[ArrayLike, "height width"]
+        | Float[ArrayLike, "height width coefficient"]
         | None = None,
     ) -> "RelightState":
         """The state with one more light, at the end.
@@ -182,7 +197,7 @@ class RelightState(eqx.Module):
         **Arguments:**
 
         - `light`: of any kind.
-        - `visibility`: height width, in [0, 1]; None for no shadows.
+        - `visibility`: as in `shade`; None for no shadows.
 
         **Returns:** the new `RelightState`.
 
@@ -276,6 +291,8 @@ class RelightState(eqx.Module):
         value = share("paint(roughness=...)", roughness, ()).astype(self.color.dtype)
         exponents = jnp.where(mask[..., 0], exponent(value), surface.exponent)
         surface = surface._replace(exponent=exponents)
+        if surface.facing is not None and surface.returned is not None:
+            surface = surface._replace(returned=response(surface.facing, exponents))
         unlit = eqx.tree_at(
             lambda s: (s.surface, s.sums, s.lights, s.visibilities),
             state,
@@ -307,9 +324,10 @@ def _check(
     for light in lights:
         check_light(f"{method}(light)", light)
     cast = lambda leaf: leaf.astype(dtype)
+    name = f"{method}(visibility)"
     images = (
-        None if image is None else share(f"{method}(visibility)", image, shape).astype(dtype)
-        for image in visibilities
+        None if image is None else check_visibility(name, image, light, shape).astype(dtype)
+        for image, light in zip(visibilities, lights, strict=True)
     )
     return tuple(jax.tree.map(cast, tuple(lights))), tuple(images)
 

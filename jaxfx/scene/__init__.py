@@ -14,6 +14,7 @@
 | traced shadows | `visible` |
 | where to put few cameras that see what many see | `plan_views` |
 | bounces of indirect light | `transfer`, then `relight.indirect` |
+| shadows of light from all around | `occlusion`, a visibility of `relight` |
 
 OpenGL or Embree finds the face that every pixel shows; NumPy does the rest. Nothing here can be
 differentiated or traced. World axes are the mesh file's (y up in most of them); cameras are
@@ -24,6 +25,7 @@ from jaxfx.scene._along import gbuffer_along
 from jaxfx.scene._defaults import default_camera, default_lights
 from jaxfx.scene._load import from_trimesh, load
 from jaxfx.scene._material import Material, Sampler
+from jaxfx.scene._occlusion import occlusion
 from jaxfx.scene._plan import ViewPlan, plan_views
 from jaxfx.scene._render import depth, gbuffer, material_ids, object_ids
 from jaxfx.scene._scene import Scene, Viewpoint
@@ -46,6 +48,7 @@ __all__ = [
     "load",
     "material_ids",
     "object_ids",
+    "occlusion",
     "plan_views",
     "still_life",
     "transfer",

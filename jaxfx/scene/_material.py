@@ -15,7 +15,7 @@ from jaxfx.io import linear_from_srgb
 # The fields of `Material` that are textures, and the names of wrap modes and shaders.
 TEXTURES = ("texture", "metallic_roughness", "normal_map")
 WRAPS = ("repeat", "mirror", "clamp")
-SHADERS = ("blinn", "ggx")
+SHADERS = ("blinn", "ggx", "ggx_conserving")
 
 
 @final
@@ -80,7 +80,8 @@ class Material:
     - `normal_scale`: multiplies the normal's components along u and v.
     - `samplers`: a `Sampler` for each texture, by the name of the argument: "texture",
       "metallic_roughness" or "normal_map". The default repeats and is bilinear.
-    - `shader`: how it reflects: "ggx" as glTF states it; "blinn" with Blinn's highlight, and
+    - `shader`: how it reflects: "ggx" as glTF states it; "ggx_conserving" the same, but that no
+      more light comes back at grazing angles than falls in; "blinn" with Blinn's highlight, and
       without any where the roughness is 1 and the metallic 0. Materials of glTF files and
       trimesh's `PBRMaterial` are "ggx", those of other files "blinn".
 

@@ -76,8 +76,9 @@ def gbuffer(
     The base colour is texture x factor x vertex colour, in linear light. `ambient` is the base
     colour, `diffuse` is `base * (1 - metallic)`, `specular` mixes 0.04 and the base colour by
     `metallic`. The shader is 3, GGX, for a `Material` of that shader, as those of glTF files
-    are; for others Lambert where roughness is 1 and metallic 0, Blinn elsewhere.
-    Normals include the normal map, and face the camera, whichever side of a face is seen.
+    are, 4 for one that conserves energy; for others Lambert where roughness is 1 and metallic
+    0, Blinn elsewhere. Normals include the normal map, and face the camera, whichever side of a
+    face is seen.
     """
     view, hits, size = _visible("gbuffer", scene, camera, height, width, backend, layer_index)
     if layer_index == 0 and len(hits.pixel) == 0:

@@ -108,9 +108,11 @@ def to_gbuffer(scene: Scene, view: View, hits: Hits, height: int, width: int) ->
     color, metallic, roughness = _materials(scene, hits)
     dielectric = (1 - metallic)[:, None]
     specular = DIELECTRIC * dielectric + color * metallic[:, None]
-    is_ggx = np.array([material.shader == "ggx" for material in scene.materials])
+    of_ggx = {"ggx": 3, "ggx_conserving": 4}
+    number = np.array([of_ggx.get(material.shader, 0) for material in scene.materials])
+    number = number[scene.face_materials.take(hits.face)]
     is_shiny = (roughness < 1) | (metallic > 0)
-    shader = np.where(is_ggx[scene.face_materials.take(hits.face)], 3, 2 * is_shiny)
+    shader = np.where(number > 0, number, 2 * is_shiny)
     image = partial(_image, hits.pixel, (height, width))
     base = image(color, 0)
     return GBuffer(

@@ -16,15 +16,17 @@ from tests.cases.registry import Found, case
 from tests.cases.relight_views import FRONT, one_pixel
 
 
-# Of a pixel: N.V, roughness, metallic.
+# Of a pixel: N.V, roughness, metallic, shader.
 FURNACES = {
-    "metal, smooth": (0.5, 0.05, 1.0),
-    "metal, smooth, grazing": (0.1, 0.1, 1.0),
-    "metal, roughness 0.5": (0.5, 0.5, 1.0),
-    "metal, roughness 1": (0.5, 1.0, 1.0),
-    "white dielectric, from above": (1.0, 0.3, 0.0),
-    "white dielectric, 30 degrees up": (0.5, 0.1, 0.0),
-    "white dielectric, 6 degrees up": (0.1, 0.1, 0.0),
+    "metal, smooth": (0.5, 0.05, 1.0, 3),
+    "metal, smooth, grazing": (0.1, 0.1, 1.0, 3),
+    "metal, roughness 0.5": (0.5, 0.5, 1.0, 3),
+    "metal, roughness 1": (0.5, 1.0, 1.0, 3),
+    "white dielectric, from above": (1.0, 0.3, 0.0, 3),
+    "white dielectric, 30 degrees up": (0.5, 0.1, 0.0, 3),
+    "white dielectric, 6 degrees up": (0.1, 0.1, 0.0, 3),
+    "white dielectric, shader 4, 30 degrees up": (0.5, 0.1, 0.0, 4),
+    "white dielectric, shader 4, 6 degrees up": (0.1, 0.1, 0.0, 4),
 }
 
 
@@ -36,12 +38,12 @@ FURNACES = {
 def white_furnace(method):
     """A white GGX pixel under white light from all sides, by a sun from each: what comes back
     beyond what falls in, and what is missing of it. glTF's mix takes from the diffuse part what
-    facets turned halfway reflect, which at grazing angles is less than the highlight has; and a
-    rough metal lacks the light that meets it twice."""
+    facets turned halfway reflect, at grazing angles less than the highlight has, which shader 4
+    takes. A rough metal lacks the light that meets it twice."""
     from tests.relight.test_ggx import furnace
 
-    facing, roughness, metallic = FURNACES[method]
-    share = furnace(facing, roughness, metallic, 1.0, count=256)
+    facing, roughness, metallic, shader = FURNACES[method]
+    share = furnace(facing, roughness, metallic, 1.0, count=256, shader=shader)
     picture = np.full((4, 4, 3), share / 2)
     return Found({"gained": max(share - 1, 0.0), "lost": max(1 - share, 0.0)}, picture)
 
@@ -123,7 +125,7 @@ BALLS = {
 def environment_highlights(method):
     """A GGX ball in the surroundings, against the sum over all directions: rms error over the
     brightest value. The bound is 35 dB. A picture of few rows blurs what a mirror should show;
-    a blur is round, where a rough metal's highlight is drawn out at grazing angles."""
+    blurs are round, where a rough metal's highlight is drawn out at grazing angles."""
     from tests import test_environment as balls
 
     name, rows, metallic, roughness = BALLS[method]
@@ -138,6 +140,36 @@ def environment_highlights(method):
             radiance, normal[j, i], color, metallic, roughness, height=256
         )
     error = (image - expected)[inside] / expected.max()
+    return Found({"rms": float(np.sqrt(np.mean(error**2)))}, image / expected.max())
+
+
+# Surroundings, and the degree of the spherical harmonics.
+SHADOWED = {
+    "clouds, 9 numbers": ("clouds", 2),
+    "clouds, 16 numbers": ("clouds", 3),
+    "lamps, 9 numbers": ("lamps", 2),
+    "lamps, 16 numbers": ("lamps", 3),
+    "a sun, 16 numbers": ("sun", 3),
+}
+
+
+@case("relight", {"rms": 10 ** (-35 / 20)}, SHADOWED, needs="embreex")
+def surroundings_in_shadow(method):
+    """A floor beside a wall in surroundings, by `scene.occlusion`, against the sum over all
+    directions: rms error over the brightest value; the bound is 35 dB. Few numbers make the
+    shadow of a small lamp soft, and lose what a wall cuts sharply."""
+    from jaxfx import scene
+    from tests import test_environment as balls
+    from tests.scene.test_occlusion import floor_and_wall, traced
+
+    name, degree = SHADOWED[method]
+    mesh, gbuffer, camera = floor_and_wall()
+    radiance = getattr(balls, name)
+    occlusion = scene.occlusion(mesh, gbuffer, camera, ray_count=1024, degree=degree)
+    light = EnvironmentLight(radiance(balls.directions(32)[0]), balls.TURN)
+    image = np.asarray(relight.shade(gbuffer, camera, light, occlusion))
+    expected = traced(gbuffer, camera, radiance, balls.TURN)
+    error = (image - expected) / expected.max()
     return Found({"rms": float(np.sqrt(np.mean(error**2)))}, image / expected.max())
 
 
@@ -158,7 +190,7 @@ def harmonics_ring(method):
         picture = np.repeat(balls.spot(way, [0.5, 0.4, -1.0], 2000)[..., None], 3, axis=-1)
     else:
         picture = getattr(balls, method)(way)
-    coefficients = EnvironmentLight(picture).coefficients
+    coefficients = EnvironmentLight(picture).coefficients[:9]
     gbuffer, _, inside = balls.ball(0.0, 1.0, shader=0)
     # The side away from the sun, which the camera sees.
     turned = SphericalHarmonicsLight(coefficients)

@@ -8,6 +8,7 @@ import pytest
 from jaxfx import (
     AmbientLight,
     DirectionalLight,
+    EnvironmentLight,
     GBuffer,
     OrthographicCamera,
     PinholeCamera,
@@ -18,6 +19,8 @@ from jaxfx import (
     scene,
 )
 from tests.cases.relight_views import FRONT
+from tests.helpers.forms import first
+from tests.helpers.quick import check_slopes
 
 
 LIGHTS = {
@@ -205,17 +208,17 @@ def test_a_roughness_below_the_least_counts_as_the_least():
 
 _suns = jax.jit(
     jax.vmap(
-        lambda pixel, way: image_of(
-            *pixel,
-            DirectionalLight(-way, jnp.ones(3)),
+        lambda pixel, shader, way: relight.shade(
+            with_shader(GBuffer.metallic_roughness(*pixel), shader),
             OrthographicCamera(1.0, [0.5, 0.5], np.eye(4)),
+            DirectionalLight(-way, jnp.ones(3)),
         )[0, 0, 0],
-        in_axes=(None, 0),
+        in_axes=(None, None, 0),
     )
 )
 
 
-def furnace(facing, roughness, metallic, color, count=96):
+def furnace(facing, roughness, metallic, color, count=96, shader=3):
     """The share of white light from all sides that a pixel returns, by many suns.
 
     The ways are spread by GGX's own distribution of halfway vectors and by the cosine, so that
@@ -223,7 +226,9 @@ def furnace(facing, roughness, metallic, color, count=96):
     """
     alpha = max(roughness, 0.01) ** 2
     ratio = (np.arange(count) + 0.5) / count
-    u, angle = np.meshgrid(ratio, 2 * np.pi * ratio)
+    # Denser at both ends, where the integrand is steep.
+    weight = np.tile(6 * ratio * (1 - ratio), 2 * count)
+    u, angle = np.meshgrid(ratio * ratio * (3 - 2 * ratio), 2 * np.pi * ratio)
 
     def about_z(z):
         across = np.sqrt(np.maximum(1 - z**2, 0))
@@ -238,13 +243,14 @@ def furnace(facing, roughness, metallic, color, count=96):
     n_h, v_h = halfway[:, 2], halfway @ to_camera
     density = alpha**2 / (np.pi * (n_h**2 * (alpha**2 - 1) + 1) ** 2) * n_h / (4 * v_h)
     density = (density + np.maximum(cosine, 0) / np.pi) / 2
-    solid_angle = np.where(cosine > 0, 1 / density, 0) / len(ways)
+    solid_angle = np.where(cosine > 0, weight / density, 0) / len(ways)
     # From the surface's axes to those of a camera that looks along z.
     axes = np.stack([[-facing, 0, to_camera[0]], [0, 1, 0], -to_camera])
     pixel = [jnp.asarray(image, float) for image in one_pixel(metallic, roughness, 1.0)]
     pixel[0], pixel[3] = jnp.full((1, 1, 3), color), jnp.asarray(axes[:, 2])[None, None]
     # A sun of radiance 1 and solid angle w shows w / pi of a white Lambert surface.
-    shown = np.asarray(_suns(pixel, jnp.asarray(ways @ axes.T)))
+    number = jnp.full((1, 1), shader)
+    shown = np.asarray(_suns(pixel, number, jnp.asarray(ways @ axes.T)))
     return float(np.sum(shown * solid_angle) / np.pi)
 
 
@@ -260,10 +266,59 @@ def test_a_white_furnace_returns_no_more_than_falls_in(roughness):
     assert 0.95 < furnace(1.0, roughness, 0.0, 1.0) < 1.001
 
 
-def test_an_edit_is_a_fresh_picture_and_paint_reaches_ggx():
+@first("roughness", [0.1, 0.0, 0.05, 0.2, 0.35, 0.5, 0.7, 1.0])
+def test_a_furnace_of_shader_4_returns_no_more_than_falls_in_at_any_angle(roughness):
+    """White, of any metallic: by suns, and all of it for a dielectric, whose diffuse part gets
+    what the highlight leaves."""
+    for facing in (0.02, 0.03, 0.06, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 1.0):
+        for metallic in (0.0, 0.5, 1.0):
+            found = furnace(facing, roughness, metallic, 1.0, count=128, shader=4)
+            assert found < 1.001, (facing, metallic)
+            if metallic == 0:
+                assert found > 0.995, facing
+
+
+def test_shader_4_is_gltf_s_highlight_and_what_it_leaves():
+    """A white surface in a white room shows exactly white; a metal is the same as glTF's."""
+    color, _, roughness, normal, depth = materials(np.random.default_rng(8))
+    room = EnvironmentLight(np.ones((4, 8, 3)))
+    make = lambda color, metallic, shader: with_shader(
+        GBuffer.metallic_roughness(color, np.full(SIZE, metallic), roughness, normal, depth),
+        np.full(SIZE, shader),
+    )
+    white = relight.shade(make(np.ones((*SIZE, 3)), 0.0, 4), CAMERA, room)
+    np.testing.assert_allclose(white, 1, rtol=1e-12)
+    for light in LIGHTS.values():
+        metals = [relight.shade(make(color, 1.0, n), CAMERA, light) for n in (3, 4)]
+        np.testing.assert_allclose(*metals, rtol=1e-12)
+        black = [relight.shade(make(0 * color, 0.0, n), CAMERA, light) for n in (3, 4)]
+        np.testing.assert_allclose(*black, rtol=1e-12)
+
+
+def test_slopes_of_shader_4():
+    rng = np.random.default_rng(9)
+    color, _, _, normal, depth = materials(rng)
+    # Amid cells of the table, at whose borders its slope jumps.
+    roughness = (rng.integers(8, 30, SIZE) + 0.4) / 32
+    weight = rng.normal(size=(*SIZE, 3))
+
+    def score(color, roughness, specular, light):
+        one = jnp.full(SIZE, 0.5)
+        gbuffer = GBuffer.metallic_roughness(color, one, roughness, normal, depth)
+        fields = vars(gbuffer) | {"specular": specular, "shader": np.full(SIZE, 4)}
+        return jnp.sum(weight * relight.shade(GBuffer(**fields), CAMERA, light))
+
+    arguments = color, roughness, 0.5 * color, LIGHTS["spot"]
+    arguments = jax.tree.map(jnp.asarray, arguments)
+    check_slopes(score, arguments, rtol=1e-5, atol=1e-5, eps=1e-6)
+
+
+@pytest.mark.parametrize("shader", [3, 4])
+def test_an_edit_is_a_fresh_picture_and_paint_reaches_ggx(shader):
     rng = np.random.default_rng(3)
     color, metallic, roughness, normal, depth = materials(rng)
     gbuffer = GBuffer.metallic_roughness(color, metallic, roughness, normal, depth)
+    gbuffer = with_shader(gbuffer, np.full(SIZE, shader))
     lights = [LIGHTS["point"], LIGHTS["sun"], AmbientLight([0.1, 0.2, 0.3])]
     state = relight.start(gbuffer, CAMERA, lights)
     np.testing.assert_allclose(state.image, relight.render(gbuffer, CAMERA, lights), rtol=1e-12)
@@ -284,10 +339,10 @@ def test_other_shaders_do_not_change_beside_it():
     """A cache of all models is one of each, pixel by pixel, bit by bit in the same program."""
     rng = np.random.default_rng(4)
     gbuffer = GBuffer.metallic_roughness(*materials(rng))
-    shader = rng.permutation(20).reshape(SIZE) % 4
+    shader = rng.permutation(20).reshape(SIZE) % 5
     with_all = jax.jit(lambda s: relight.shade(with_shader(gbuffer, s), CAMERA, LIGHTS["spot"]))
     mixed = with_all(shader)
-    for number in range(4):
+    for number in range(5):
         alone = relight.shade(
             with_shader(gbuffer, np.full(SIZE, number)), CAMERA, LIGHTS["spot"]
         )

@@ -399,7 +399,7 @@ def test_any_size_and_batches_of_lights(size):
 
 
 def test_an_unknown_shader_is_named_or_black():
-    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1, 2 or 3"):
+    with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1, 2, 3 or 4"):
         relight.shade(one_pixel(4), FRONT, LIGHTS["ambient"])
     assert not jax.jit(relight.shade)(one_pixel(4), FRONT, LIGHTS["ambient"]).any()
 
