@@ -17,6 +17,7 @@ comparison.
 
 from jaxfx.fit.camera import CameraFit, camera
 from jaxfx.fit.dof import DISPARITY_PARAMETERS, LAYERED_PARAMETERS, PARAMETERS, DofFit, dof
+from jaxfx.fit.focal_stack import FocalStackFit, focal_stack
 from jaxfx.fit.lights import LIGHT_PARAMETERS, LightsFit, lights
 
 
@@ -27,8 +28,10 @@ __all__ = [
     "PARAMETERS",
     "CameraFit",
     "DofFit",
+    "FocalStackFit",
     "LightsFit",
     "camera",
     "dof",
+    "focal_stack",
     "lights",
 ]
