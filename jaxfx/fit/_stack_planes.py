@@ -73,8 +73,9 @@ def compared(
     def fitted(inverse_depth: Array) -> tuple[Array, Array]:
         circles = jnp.abs(strengths * (foci - inverse_depth))
         blurs = jax.vmap(lambda c: disc(c * frequency))(circles)[..., None]
-        power = jnp.sum(blurs * blurs, axis=0) + _NOISE
-        sharp = jnp.sum(blurs * spectra, axis=0) / power
+        quotients = blurs / (jnp.sum(blurs * blurs, axis=0) + _NOISE)[None]
+        blurs, quotients = (x.astype(spectra.dtype) for x in (blurs, quotients))
+        sharp = jnp.sum(quotients * spectra, axis=0)
         return image_of(spectra - blurs * sharp[None]), image_of(sharp)
 
     floor = _LEAST_NOISE**2 * jnp.mean(images * images)
@@ -98,7 +99,7 @@ def disc(cycles: Float[Array, "..."]) -> Float[Array, "..."]:
     It is `2 J1(x) / x` with `x = pi * cycles`, as the integral of `sqrt(1 - t^2) cos(x t)` by
     Gauss and Chebyshev's rule, exact to rounding for circles of 60 pixels.
     """
-    count = 72
+    count = 144
     angles = np.pi * np.arange(1, count + 1) / (count + 1)
     weights = 2 * np.sin(angles) ** 2 / (count + 1)
 
@@ -131,17 +132,16 @@ def _summed(values: Array, weights: np.ndarray) -> Array:
     for axis in (0, 1):
         pads = [(far, far) if a == axis else (0, 0) for a in (0, 1)]
         padded = jnp.pad(values, pads, mode="edge")
-        size = values.shape[axis]
-        values = sum(
-            jnp.asarray(weight, values.dtype)
-            * jax.lax.slice_in_dim(padded, at, at + size, axis=axis)
-            for at, weight in enumerate(weights)
-        )
+        size, total = values.shape[axis], jnp.zeros_like(values)
+        for at, weight in enumerate(weights):
+            part = jax.lax.slice_in_dim(padded, at, at + size, axis=axis)
+            total = total + jnp.asarray(weight, values.dtype) * part
+        values = total
     return values
 
 
 def best(planes: Planes, candidates: Array) -> Float[Array, "height width"]:
-    """The inverse depth of least energy: the best plane, and a parabola through its neighbors."""
+    """The inverse depth of least energy, by a parabola through the best plane's neighbors."""
     energy = planes.energy
     index = jnp.clip(jnp.argmin(energy, axis=0), 1, len(candidates) - 2)
     before, at, after = (at_index(energy, index + step) for step in (-1, 0, 1))

@@ -1,5 +1,7 @@
 """The search of `fit.focal_stack`: image and inverse depth, by gradients through the effect."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,9 +19,9 @@ _BEND = 0.05
 # Difference in luminance between neighbors, as a ratio to the images' root mean square, that
 # lowers the prior by a factor of e: surfaces often end where the image has an edge.
 _EDGE = 0.3
-# What an unknown of 1 changes: the defocus, in pixels, and the image, as a ratio to the images'
-# root mean square. The images depend about as much on either; else the search is slow.
-_SHIFT, _CHANGE = 1.0, 0.5
+# Change of an image by a pixel of defocus, as a ratio to the images' root mean square. It only
+# scales the unknowns: a wrong one makes the search slow.
+_CONTRAST = 0.1
 
 
 class StackResidual(eqx.Module):
@@ -44,10 +46,18 @@ class StackResidual(eqx.Module):
     max_coc: int | float = eqx.field(static=True)
 
     def values(self, unknowns: dict[str, Array]) -> tuple[Array, Array]:
-        """Image and inverse depth, from unknowns, which are 0 at the start."""
-        shift = unknowns["shift"].astype(self.image.dtype) * (_SHIFT / self.strength)
-        change = unknowns["change"].astype(self.image.dtype) * (_CHANGE * self.level)
-        return self.image + change, jnp.clip(self.inverse_depth + shift, *self.bounds)
+        """Image and inverse depth, from unknowns, which are 0 at the start.
+
+        They are scaled so that the mean squared residual bends by about 1 in each.
+        """
+        unit = self.noise * math.sqrt(self.images.size / 2)
+        seen = self.images.size / self.inverse_depth.size * (_CONTRAST * self.level) ** 2
+        # A pixel's bend counts in three second differences along each axis: 2 (1 + 4 + 1).
+        bends = 12 * self.smoothness * (self.noise / _BEND) ** 2
+        shift = unit / jnp.sqrt(seen + bends) / self.strength
+        inverse_depth = self.inverse_depth + shift * unknowns["shift"].astype(shift.dtype)
+        image = self.image + unit * unknowns["change"].astype(unit.dtype)
+        return image, jnp.clip(inverse_depth, *self.bounds)
 
     def drawn(
         self, image: Array, inverse_depth: Array
@@ -75,9 +85,7 @@ class StackResidual(eqx.Module):
             bend = jnp.diff(inverse_depth, n=2, axis=axis) * (self.strength / _BEND)
             step = jnp.abs(jnp.diff(luminance, axis=axis)) / (_EDGE * self.level)
             count = step.shape[axis]
-            sides = [
-                jax.lax.slice_in_dim(step, at, at + count - 1, axis=axis) for at in (0, 1)
-            ]
+            sides = [jax.lax.slice_in_dim(step, at, at + count - 1, axis=axis) for at in (0, 1)]
             weight = jnp.sqrt(self.smoothness * jnp.exp(-jnp.maximum(*sides)))
             parts.append((weight * _eased(bend)).reshape(-1))
         return jnp.concatenate(parts).astype(float)

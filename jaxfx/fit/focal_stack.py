@@ -14,11 +14,19 @@ from jaxtyping import Array, Bool, Float
 from jaxfx import depth as depths
 from jaxfx._arguments import check_lens
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, WholeNumber, check, check_image, items, number, option
-from jaxfx._checks import whole_number
+from jaxfx._checks import (
+    Number,
+    WholeNumber,
+    check,
+    check_image,
+    items,
+    number,
+    option,
+    whole_number,
+)
 from jaxfx._numerics import working_dtype
 from jaxfx._progress import Bar
-from jaxfx.fit._descent import check_success, descend, verdict
+from jaxfx.fit._descent import End, check_success, descend, verdict
 from jaxfx.fit._lens_model import Effect
 from jaxfx.fit._stack_planes import (
     WINDOW,
@@ -125,7 +133,7 @@ def focal_stack(
       `"layered"`, which takes longer.
     - `smoothness`: weight of the prior, a ratio: each bend of the inverse depth counts like a
       difference of images as large as their noise where it is 0.05 pixels of defocus.
-    - `max_steps`: of the search through the effect.
+    - `max_steps`: of the search through the effect; 0 ends with the planes, see below.
     - `throw`: raise where the fit is no success; else `doubt` says why.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
@@ -145,7 +153,7 @@ def focal_stack(
     >>> lenses = [ThinLens(0.3, focus, 60.0) for focus in (2.0, 3.0, 5.0)]
     >>> depth = np.full((24, 24), 2.5, np.float32)
     >>> images = [dof.scatter(wall, depth, lens) for lens in lenses]
-    >>> found = fit.focal_stack(images, lenses, max_steps=2)
+    >>> found = fit.focal_stack(images, lenses, max_steps=0)
     >>> bool(abs(np.median(found.depth) - 2.5) < 0.1)
     True
 
@@ -170,7 +178,9 @@ def focal_stack(
     smoothness = number(
         "focal_stack(smoothness=...)", smoothness, lambda x: 0 <= x < math.inf, "0 or positive"
     )
-    max_steps = whole_number("focal_stack(max_steps=...)", max_steps)
+    max_steps = whole_number(
+        "focal_stack(max_steps=...)", max_steps, lambda n: n >= 0, "an integer from 0"
+    )
     strengths, foci = _lines(lenses)
     low, high = _range(foci, nearest, farthest)
     largest = _largest(strengths, foci, low, high)
@@ -186,13 +196,16 @@ def focal_stack(
         error = _errors(planes, candidates, start)
         start = _filled(start, error, stack)
         residual = _residual(stack, lenses, planes, candidates, start, smoothness, effect)
-        residual = eqx.tree_at(lambda r: r.strength, residual, jnp.mean(lines[0]))
         unknowns = {
             "shift": jnp.zeros(start.shape, float),
             "change": jnp.zeros(residual.image.shape, float),
         }
-        solver = optx.NonlinearCG(rtol=1e-3, atol=1e-3)
-        end = descend(residual, unknowns, solver=solver, max_steps=max_steps, bar=bar)
+        if max_steps:
+            solver = optx.NonlinearCG(rtol=1e-3, atol=1e-3)
+            end = descend(residual, unknowns, solver=solver, max_steps=max_steps, bar=bar)
+        else:
+            loss = jnp.mean(residual(unknowns) ** 2)
+            end = End(unknowns, [loss], optx.RESULTS.successful)
     image, inverse_depth = residual.values(end.unknowns)
     left = jnp.mean((residual.drawn(image, inverse_depth) - stack) ** 2)
     varies = jnp.mean((stack - jnp.mean(stack, axis=0, keepdims=True)) ** 2)
@@ -223,14 +236,14 @@ def _checked(images: Any, lenses: Any) -> tuple[Array, tuple[ThinLens, ...]]:
     checked = []
     for index, image in enumerate(images):
         name = f"focal_stack(images[{index}])"
-        image = check_image(name, image)
-        check(name, image, np.isfinite, "finite")
-        if checked and image.shape != checked[0].shape:
+        read = check_image(name, image)
+        check(name, read, np.isfinite, "finite")
+        if checked and read.shape != checked[0].shape:
             raise ValueError(
                 f"`{name}` must have the first image's shape {checked[0].shape}, "
-                f"got {image.shape}."
+                f"got {read.shape}."
             )
-        checked.append(image.astype(working_dtype(image.dtype)))
+        checked.append(read.astype(working_dtype(read.dtype)))
     lenses = tuple(items("focal_stack(lenses)", lenses, "a sequence of lenses"))
     if len(lenses) != len(checked):
         raise ValueError(
@@ -260,9 +273,11 @@ def _range(foci: np.ndarray, nearest: Any, farthest: Any) -> tuple[float, float]
         for name, value in named.items()
         if value is not None
     }
-    step = (foci.max() - foci.min()) / max(1, len(foci) - 1) / 2
-    low = given.get("farthest", max(foci.min() - step, foci.min() / 4))
-    high = given.get("nearest", foci.max() + step)
+    first, last = float(foci.min()), float(foci.max())
+    # Lenses that are alike are refused later, by another name.
+    step = (last - first) / max(1, len(foci) - 1) / 2 or first / 2
+    low: float = given.get("farthest", max(first - step, first / 4))
+    high: float = given.get("nearest", last + step)
     if not low < high:
         raise ValueError(
             "`focal_stack(nearest=...)` must be less than `farthest`, "
