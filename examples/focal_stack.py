@@ -32,7 +32,7 @@ from jaxfx._files import write_whole
 # The lens of the renderings: scene units, and foci evenly spaced in inverse depth.
 APERTURE, NEAREST, FARTHEST, COUNT = 0.1, 1.0, 8.0, 5
 # Depths between which the still life lies.
-RANGE = {"nearest": 0.75, "farthest": 9.0}
+RANGE = {"min_depth": 0.75, "max_depth": 9.0}
 # Where a pixel counts as textured: standard deviation of the luminance about it over the mean.
 TEXTURE = 0.1
 # The lens' points of this sequence have the second moments of a disc within 0.2 %; of most

@@ -110,8 +110,8 @@ def focal_stack(
     images: Sequence[Float[ArrayLike, "height width channel"]],
     lenses: Sequence[ThinLens],
     *,
-    nearest: Number | None = None,
-    farthest: Number | None = None,
+    min_depth: Number | None = None,
+    max_depth: Number | None = None,
     effect: Effect = "scatter",
     smoothness: Number = 1.0,
     max_steps: WholeNumber = 24,
@@ -127,7 +127,7 @@ def focal_stack(
 
     - `images`: height width channel each, linear radiance, two or more of one exposure.
     - `lenses`: one for each image, lengths in scene units; at least two focus distances.
-    - `nearest`, `farthest`: static; the depths between which it is sought, in scene units. By
+    - `min_depth`, `max_depth`: static; scene units, the depths between which it is sought. By
       default half a step of inverse focus distance beyond the least and the largest.
     - `effect`: the function of `jaxfx.dof` through which the search goes, `"scatter"` or
       `"layered"`, which takes longer.
@@ -182,7 +182,7 @@ def focal_stack(
         "focal_stack(max_steps=...)", max_steps, lambda n: n >= 0, "an integer from 0"
     )
     strengths, foci = _lines(lenses)
-    low, high = _range(foci, nearest, farthest)
+    low, high = _range(foci, min_depth, max_depth)
     largest = _largest(strengths, foci, low, high)
     count = math.ceil(strengths.mean() * (high - low) / _STEP) + 1
     dtype = stack.dtype
@@ -264,10 +264,10 @@ def _lines(lenses: tuple[ThinLens, ...]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(strengths), np.array([1 / float(lens.focus_distance) for lens in lenses])
 
 
-def _range(foci: np.ndarray, nearest: Any, farthest: Any) -> tuple[float, float]:
+def _range(foci: np.ndarray, min_depth: Any, max_depth: Any) -> tuple[float, float]:
     """The inverse depths between which the search goes."""
     is_depth = lambda x: 0 < x < math.inf
-    named = {"nearest": nearest, "farthest": farthest}
+    named = {"min_depth": min_depth, "max_depth": max_depth}
     given = {
         name: 1 / number(f"focal_stack({name}=...)", value, is_depth, "positive and finite")
         for name, value in named.items()
@@ -276,11 +276,11 @@ def _range(foci: np.ndarray, nearest: Any, farthest: Any) -> tuple[float, float]
     first, last = float(foci.min()), float(foci.max())
     # Lenses that are alike are refused later, by another name.
     step = (last - first) / max(1, len(foci) - 1) / 2 or first / 2
-    low: float = given.get("farthest", max(first - step, first / 4))
-    high: float = given.get("nearest", last + step)
+    low: float = given.get("max_depth", max(first - step, first / 4))
+    high: float = given.get("min_depth", last + step)
     if not low < high:
         raise ValueError(
-            "`focal_stack(nearest=...)` must be less than `farthest`, "
+            "`focal_stack(min_depth=...)` must be less than `max_depth`, "
             f"got {1 / high:.4g} and {1 / low:.4g}."
         )
     return low, high
