@@ -13,9 +13,9 @@
 # %% [markdown]
 # # How far away is it? Ask the focus ring
 #
-# Five photographs from a tripod, the focus moved from near to far. Nothing else changes, so what
-# is sharp when tells how far away it is. `fit.focal_stack` finds from them the picture in which
-# all is sharp, and a depth for every pixel with the error that it may have.
+# Five photographs from a tripod, the focus moved from near to far. Nothing else changes, so
+# what is sharp when tells how far away it is. `fit.focal_stack` finds from them the picture in
+# which all is sharp, and a depth for every pixel with the error that it may have.
 #
 # Here the photographs are rendered, through points all over a lens, so that the truth is known.
 
@@ -68,7 +68,7 @@ show({f"focus at {f:.1f}": image for f, image in zip(foci, photographs, strict=T
 # error is below a tenth of their depth.
 
 # %%
-options = {"min_depth": 0.75, "max_depth": 9.0, "max_steps": 0}
+options = {"min_depth": 0.75, "max_depth": 9.0, "max_steps": 12}
 found = fit.focal_stack(photographs, lenses, **options)
 depth = np.asarray(scene.gbuffer(room, camera, **SIZE).depth)
 off = np.abs(np.asarray(found.depth) / depth - 1)
@@ -94,12 +94,14 @@ show({"1 / depth, found": 1 / np.asarray(found.depth), "1 / depth, true": 1 / de
 # %%
 brighter = [photographs[0], 1.2 * photographs[1], *photographs[2:]]
 even = [np.full_like(image, 0.5) for image in photographs]
+again = options | {"max_steps": 0}
 for name, images in {"brighter": brighter, "even": even}.items():
-    print(f"{name}: {fit.focal_stack(images, lenses, throw=False, **options).doubt}")
+    print(f"{name}: {fit.focal_stack(images, lenses, throw=False, **again).doubt}")
 
 # %% [markdown]
 # ## What no focal stack can tell
 #
 # The depth of an even surface: it looks the same in every focus. And what lies beside an edge,
 # closer than the radius of the blur: the lens looks around the edge there, and a window about
-# such a pixel shows two surfaces. A lens whose picture grows with its focus must be undone first.
+# such a pixel shows two surfaces. A lens whose picture grows with its focus must be undone
+# first.

@@ -33,7 +33,7 @@ class Planes(NamedTuple):
     """What each plane says of each pixel, planes along the first axis.
 
     - `energy`: sum of squared residuals in the window, squared units of radiance.
-    - `slope`: sum of squares of their derivatives in the inverse depth, by the plane's blur.
+    - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
     - `spread`: variance of the sum of residuals times derivatives.
     - `image`: the all-in-focus image if all were on the plane.
     """
@@ -78,17 +78,29 @@ def compared(
         sharp = jnp.sum(quotients * spectra, axis=0)
         return image_of(spectra - blurs * sharp[None]), image_of(sharp)
 
+    def projector(inverse_depth: Array) -> Array:
+        """What a plane leaves of the images: a matrix at each frequency."""
+        circles = jnp.abs(strengths * (foci - inverse_depth))
+        blurs = jax.vmap(lambda c: disc(c * frequency))(circles)
+        power = jnp.sum(blurs * blurs, axis=0) + _NOISE
+        one = jnp.eye(len(circles), dtype=dtype)[..., None, None]
+        return one - blurs[:, None] * blurs[None] / power[None, None]
+
     floor = _LEAST_NOISE**2 * jnp.mean(images * images)
 
     def plane(carry: None, inverse_depth: Array) -> tuple[None, Planes]:
         one = jnp.ones_like(inverse_depth)
         (residual, sharp), (slope, _) = jax.jvp(fitted, (inverse_depth,), (one,))
         over = (0, 3)
+        # Noise alone has slopes too: as much, for the residuals that it leaves, as white noise.
+        left, turned = jax.jvp(projector, (inverse_depth,), (one,))
+        white = jnp.sum(turned * turned) / jnp.sum(left * left)
+        energy = windowed(jnp.sum(residual * residual, axis=over))
         steepness = jnp.sum(slope * slope, axis=over)
         score = _boxed(jnp.sum(residual * slope, axis=over)) / _BLOCK
         spread = windowed(score * score + floor * steepness)
-        energy = windowed(jnp.sum(residual * residual, axis=over))
-        return carry, Planes(energy, windowed(steepness), spread, sharp)
+        told = jnp.maximum(windowed(steepness) - white * energy, 0)
+        return carry, Planes(energy, told, spread, sharp)
 
     return scan(plane, None, candidates)[1]
 

@@ -43,7 +43,7 @@ from jaxfx.lens import ThinLens
 # depth that is determined, over the depth; the least share of pixels that are; the least
 # variation from image to image that is explained; the largest difference in exposure. Looser
 # bounds trust stacks that show nothing, tighter ones doubt those of which half is even.
-_MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.7, 0.05
+_MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.5, 0.05
 # Pixels of defocus from one candidate plane to the next. Coarser planes miss the least energy,
 # finer ones cost time alone.
 _STEP = 0.35

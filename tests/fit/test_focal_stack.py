@@ -1,6 +1,8 @@
 """Depth and image from focal stacks: walls whose circles of confusion are known, and rooms."""
 
+import importlib.util
 import inspect
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +86,7 @@ FAILURES = {
     "alike": (lambda images: [images[0]] * len(images), "of what varies"),
     "strangers": (
         lambda images: [texture(seed=seed) for seed in range(len(images))],
-        "of what varies",
+        "determine the depth of 0 %",
     ),
 }
 
@@ -157,7 +159,7 @@ def test_the_still_life():
     module = importlib.util.module_from_spec(example)
     example.loader.exec_module(module)
     images, lenses, sharp, depth = module.rendered(96, 124)
-    found = fit.focal_stack(images, lenses, **module.RANGE, max_steps=0, throw=False)
+    found = fit.focal_stack(images, lenses, **module.RANGE, max_steps=8, throw=False)
     assert found.success, found.doubt
     table = module.compared(found, images, lenses, sharp, depth)
     ours, usual = table["fit"], table["depth from focus"]
