@@ -194,8 +194,13 @@ def focal_stack(
         bar.step(planes=str(len(candidates)))
         start = best(planes, candidates)
         error = _errors(planes, candidates, start)
+        # An image that fits is seen through planes that fit, told or not.
+        image = at_inverse_depth(planes.image, candidates, start)
+        energy = at_inverse_depth(planes.energy, candidates, start)
         start = _filled(start, error, stack)
-        residual = _residual(stack, lenses, planes, candidates, start, smoothness, effect)
+        residual = _residual(
+            stack, lenses, image, energy, candidates, start, smoothness, effect
+        )
         unknowns = {
             "shift": jnp.zeros(start.shape, float),
             "change": jnp.zeros(residual.image.shape, float),
@@ -321,15 +326,15 @@ def _filled(inverse_depth: Array, error: Array, stack: Array) -> Array:
 def _residual(
     stack: Array,
     lenses: tuple[ThinLens, ...],
-    planes: Planes,
+    image: Array,
+    energy: Array,
     candidates: Array,
     start: Array,
     smoothness: float,
     effect: Effect,
 ) -> StackResidual:
-    """What the search makes small, at the planes' image and depth."""
+    """What the search makes small, from the planes' image, energy and depth."""
     dtype = stack.dtype
-    energy = at_inverse_depth(planes.energy, candidates, start)
     level = jnp.sqrt(jnp.mean(stack * stack))
     area = 2 * math.pi * WINDOW**2 * len(stack) * stack.shape[-1]
     noise = jnp.sqrt(jnp.median(energy) / area) + 1e-3 * level
@@ -338,7 +343,7 @@ def _residual(
     return StackResidual(
         images=stack,
         lenses=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(dtype), *lenses),
-        image=at_inverse_depth(planes.image, candidates, start),
+        image=image,
         inverse_depth=start,
         bounds=(candidates[0], candidates[-1]),
         strength=jnp.mean(jnp.asarray(strengths, dtype)),
