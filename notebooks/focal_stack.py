@@ -99,7 +99,7 @@ for name, images in {"brighter": brighter, "even": even}.items():
     print(f"{name}: {fit.focal_stack(images, lenses, throw=False, **again).doubt}")
 
 # %% [markdown]
-# ## What no focal stack can tell
+# ## What a focal stack cannot tell
 #
 # The depth of an even surface: it looks the same in every focus. And what lies beside an edge,
 # closer than the radius of the blur: the lens looks around the edge there, and a window about
