@@ -241,6 +241,13 @@ CALLS = {
             **{"visibilities": [LIT], "rounds": 1},
         },
     ),
+    "fit.focal_stack": (
+        ft.partial(fit.focal_stack, throw=False),
+        {
+            **{"images": [IMAGE, IMAGE], "lenses": [LENS, ThinLens(0.1, 1.0, 60.0)]},
+            **{"min_depth": 0.9, "max_depth": 4.0, "smoothness": 1.0, "max_steps": 0},
+        },
+    ),
     "shadow.MovingShadow": (
         _moving_shadow,
         {
@@ -364,6 +371,7 @@ STATIC = {
     *("size", "dilation", "stride", "rounds", "slices", "height", "width", "i"),
 }
 NUMBERS = {"max_coc", "hole_threshold", "max_error", "tolerance", "angle"}
+NUMBERS |= {"min_depth", "max_depth", "smoothness"}
 # Values of these are parameters of a lens of our own, `FocusPlanes(max_coc)`.
 TRACED = {("FocusPlanes", "max_coc")}
 

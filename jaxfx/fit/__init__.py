@@ -5,6 +5,7 @@
 | the lens that took a photograph | `fit.dof(..., effect="layered")` |
 | `gamma` and `epsilon` that make `dof.scatter` look most like a photograph | `fit.dof(...)` |
 | the scale and shift of a network's depth, beside the lens | `fit.dof(..., parameters=...)` |
+| depth and an all-in-focus image from a focal stack | `fit.focal_stack` |
 | the pose of a second photograph | `fit.camera` |
 | the colors, positions and directions of lights | `fit.lights` |
 | a sun by the edge of its shadow | `fit.lights` with `shadow.MovingShadow`, `loss="squares"` |
@@ -17,6 +18,7 @@ comparison.
 
 from jaxfx.fit.camera import CameraFit, camera
 from jaxfx.fit.dof import DISPARITY_PARAMETERS, LAYERED_PARAMETERS, PARAMETERS, DofFit, dof
+from jaxfx.fit.focal_stack import FocalStackFit, focal_stack
 from jaxfx.fit.lights import LIGHT_PARAMETERS, LightsFit, lights
 
 
@@ -27,8 +29,10 @@ __all__ = [
     "PARAMETERS",
     "CameraFit",
     "DofFit",
+    "FocalStackFit",
     "LightsFit",
     "camera",
     "dof",
+    "focal_stack",
     "lights",
 ]

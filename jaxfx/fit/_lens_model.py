@@ -196,7 +196,7 @@ class Model(eqx.Module):
             if "footprint" not in self.names:
                 return drawn
             coc = jnp.where(depth > 0, lens.circle_of_confusion(depth), 0)
-            return drawn + values["footprint"] * _missing_blur(drawn, coc)
+            return drawn + values["footprint"] * missing_blur(drawn, coc)
 
         focal_pixels = self.images.focal_pixels
         apertures, focus_distances = (values[name] for name in LENS)
@@ -205,7 +205,7 @@ class Model(eqx.Module):
         return jax.vmap(draw)(apertures, focus_distances, focal_pixels)
 
 
-def _missing_blur(
+def missing_blur(
     drawn: Float[Array, "height width channel"], coc: Float[Array, "height width"]
 ) -> Float[Array, "height width channel"]:
     """What a footprint of 1 adds to a drawn image.

@@ -46,7 +46,9 @@ def test_what_a_search_under_a_transform_can_not_do_is_refused():
 
 
 def test_a_search_inside_shard_map_is_refused_by_name():
-    mesh, spec = jax.make_mesh((1,), ("frames",)), jax.sharding.PartitionSpec("frames")
+    auto = (jax.sharding.AxisType.Auto,)
+    mesh = jax.make_mesh((1,), ("frames",), axis_types=auto)
+    spec = jax.sharding.PartitionSpec("frames")
     fitted = jax.vmap(
         lambda image: fit.camera(image, image, DEPTH, CAMERA, CAMERA, throw=False).share
     )

@@ -400,8 +400,8 @@ def test_any_size_and_batches_of_lights(size):
 
 def test_an_unknown_shader_is_named_or_black():
     with pytest.raises(ValueError, match=r"`GBuffer\(shader\)` must be -1, 0, 1, 2, 3 or 4"):
-        relight.shade(one_pixel(4), FRONT, LIGHTS["ambient"])
-    assert not jax.jit(relight.shade)(one_pixel(4), FRONT, LIGHTS["ambient"]).any()
+        relight.shade(one_pixel(5), FRONT, LIGHTS["ambient"])
+    assert not jax.jit(relight.shade)(one_pixel(5), FRONT, LIGHTS["ambient"]).any()
 
 
 def test_errors_name_the_argument():

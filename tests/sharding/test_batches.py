@@ -25,7 +25,8 @@ NO_BATCH = {
     *("io.linear_from_srgb", "io.read_color", "io.read_depth", "io.read_png"),
     *("io.srgb_from_linear", "io.write_png"),
     *("scene.default_camera", "scene.default_lights", "scene.depth", "scene.from_trimesh"),
-    *("scene.gbuffer", "scene.load", "scene.material_ids", "scene.object_ids"),
+    *("scene.gbuffer", "scene.gbuffer_along", "scene.load", "scene.material_ids"),
+    *("scene.object_ids", "scene.occlusion"),
     *("scene.plan_views", "scene.still_life", "scene.transfer", "scene.visible"),
     *("tradeoff.measure", "tradeoff.pareto", "tradeoff.plot", "tradeoff.save"),
 }

@@ -1,0 +1,178 @@
+"""Planes that are compared with a focal stack: of each, what the images say of every pixel.
+
+Where the depth is constant, an image of the stack is the all-in-focus image convolved with a
+disc. So for a candidate plane the image that explains the stack best is a quotient of Fourier
+transforms, and what is left over, in a window about a pixel, tells how well the plane fits.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfx._loops import scan
+
+
+# Standard deviation in pixels of the window over which residuals are summed. A smaller one
+# mistakes noise for depth, a larger one mixes surfaces.
+WINDOW = 1.5
+# Side in pixels of the blocks within which errors may depend on one another. With 1, rounding
+# and aliasing, which neighbors share, would make standard errors too small.
+_BLOCK = 5
+# Noise that is always allowed for, as a ratio to the images' root mean square.
+_LEAST_NOISE = 1e-3
+# Power of the noise over that of the image in the quotient, a ratio. Larger blurs the image,
+# smaller lets the errors of one surface ring over others.
+_NOISE = 1e-2
+
+
+class Planes(NamedTuple):
+    """What each plane says of each pixel, planes along the first axis.
+
+    - `energy`: sum of squared residuals in the window, squared units of radiance.
+    - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
+    - `spread`: variance of the sum of residuals times derivatives.
+    - `image`: the all-in-focus image if all were on the plane.
+    """
+
+    energy: Float[Array, "plane height width"]
+    slope: Float[Array, "plane height width"]
+    spread: Float[Array, "plane height width"]
+    image: Float[Array, "plane height width channel"]
+
+
+@functools.partial(jax.jit, static_argnames=("pad",))
+def compared(
+    images: Float[Array, "photograph height width channel"],
+    strengths: Float[Array, " photograph"],
+    foci: Float[Array, " photograph"],
+    candidates: Float[Array, " plane"],
+    pad: int,
+) -> Planes:
+    """The planes at inverse depths `candidates`, for lenses in focus at inverse depths `foci`.
+
+    `strengths` are the diameters of circles of confusion per unit of inverse depth, in pixels;
+    `pad` is how many pixels the images are mirrored beyond their border.
+    """
+    _, height, width, _ = images.shape
+    dtype = images.dtype
+    mirrored = jnp.pad(images, ((0, 0), (pad, pad), (pad, pad), (0, 0)), mode="symmetric")
+    rows, columns = mirrored.shape[1:3]
+    spectra = jnp.fft.rfft2(mirrored, axes=(1, 2))
+    frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None])
+    frequency = jnp.asarray(frequency, dtype)
+
+    def image_of(spectrum: Array) -> Array:
+        size, axes = (rows, columns), (-3, -2)
+        whole = jnp.fft.irfft2(spectrum, s=size, axes=axes)
+        return whole[..., pad : pad + height, pad : pad + width, :].astype(dtype)
+
+    def fitted(inverse_depth: Array) -> tuple[Array, Array]:
+        circles = jnp.abs(strengths * (foci - inverse_depth))
+        blurs = jax.vmap(lambda c: disc(c * frequency))(circles)[..., None]
+        quotients = blurs / (jnp.sum(blurs * blurs, axis=0) + _NOISE)[None]
+        blurs, quotients = (x.astype(spectra.dtype) for x in (blurs, quotients))
+        sharp = jnp.sum(quotients * spectra, axis=0)
+        return image_of(spectra - blurs * sharp[None]), image_of(sharp)
+
+    def projector(inverse_depth: Array) -> Array:
+        """What a plane leaves of the images: a matrix at each frequency."""
+        circles = jnp.abs(strengths * (foci - inverse_depth))
+        blurs = jax.vmap(lambda c: disc(c * frequency))(circles)
+        power = jnp.sum(blurs * blurs, axis=0) + _NOISE
+        one = jnp.eye(len(circles), dtype=dtype)[..., None, None]
+        return one - blurs[:, None] * blurs[None] / power[None, None]
+
+    floor = _LEAST_NOISE**2 * jnp.mean(images * images)
+
+    def plane(carry: None, inverse_depth: Array) -> tuple[None, Planes]:
+        one = jnp.ones_like(inverse_depth)
+        (residual, sharp), (slope, _) = jax.jvp(fitted, (inverse_depth,), (one,))
+        over = (0, 3)
+        # Noise alone has slopes too: as much, for the residuals that it leaves, as white noise.
+        left, turned = jax.jvp(projector, (inverse_depth,), (one,))
+        white = jnp.sum(turned * turned) / jnp.sum(left * left)
+        energy = windowed(jnp.sum(residual * residual, axis=over))
+        steepness = jnp.sum(slope * slope, axis=over)
+        score = _boxed(jnp.sum(residual * slope, axis=over)) / _BLOCK
+        spread = windowed(score * score + floor * steepness)
+        told = jnp.maximum(windowed(steepness) - white * energy, 0)
+        return carry, Planes(energy, told, spread, sharp)
+
+    return scan(plane, None, candidates)[1]
+
+
+def disc(cycles: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The Fourier transform of a disc of area 1, at its diameter times the frequency.
+
+    It is `2 J1(x) / x` with `x = pi * cycles`, as the integral of `sqrt(1 - t^2) cos(x t)` by
+    Gauss and Chebyshev's rule, exact to rounding for circles of 60 pixels.
+    """
+    count = 144
+    angles = np.pi * np.arange(1, count + 1) / (count + 1)
+    weights = 2 * np.sin(angles) ** 2 / (count + 1)
+
+    def add(total: Array, node: tuple[Array, Array]) -> tuple[Array, None]:
+        place, weight = node
+        return total + weight * jnp.cos(np.pi * place * cycles), None
+
+    # The rule is symmetric: half of the nodes, each twice.
+    half = count // 2
+    nodes = [
+        jnp.asarray(values[:half], cycles.dtype) for values in (np.cos(angles), 2 * weights)
+    ]
+    return scan(add, jnp.zeros_like(cycles), tuple(nodes))[0]
+
+
+def windowed(values: Float[Array, "height width"]) -> Float[Array, "height width"]:
+    """The sum over the window about each pixel, of weight 1 at the pixel."""
+    far = int(np.ceil(3 * WINDOW))
+    weights = np.exp(-0.5 * (np.arange(-far, far + 1) / WINDOW) ** 2)
+    return _summed(values, weights)
+
+
+def _boxed(values: Float[Array, "height width"]) -> Float[Array, "height width"]:
+    return _summed(values, np.ones(_BLOCK))
+
+
+def _summed(values: Array, weights: np.ndarray) -> Array:
+    """The weighted sums over rows and columns; beyond the border the last pixel is repeated."""
+    far = len(weights) // 2
+    for axis in (0, 1):
+        pads = [(far, far) if a == axis else (0, 0) for a in (0, 1)]
+        padded = jnp.pad(values, pads, mode="edge")
+        size, total = values.shape[axis], jnp.zeros_like(values)
+        for at, weight in enumerate(weights):
+            part = jax.lax.slice_in_dim(padded, at, at + size, axis=axis)
+            total = total + jnp.asarray(weight, values.dtype) * part
+        values = total
+    return values
+
+
+def best(planes: Planes, candidates: Array) -> Float[Array, "height width"]:
+    """The inverse depth of least energy, by a parabola through the best plane's neighbors."""
+    energy = planes.energy
+    index = jnp.clip(jnp.argmin(energy, axis=0), 1, len(candidates) - 2)
+    before, at, after = (at_index(energy, index + step) for step in (-1, 0, 1))
+    bend = before - 2 * at + after
+    step = jnp.where(bend > 0, (before - after) / jnp.where(bend > 0, 2 * bend, 1), 0)
+    spacing = candidates[1] - candidates[0]
+    return candidates[0] + spacing * (index.astype(step.dtype) + jnp.clip(step, -1, 1))
+
+
+def at_index(values: Array, index: Array) -> Array:
+    """The entry of each pixel along the first axis."""
+    index = index.reshape(1, *index.shape, *(1,) * (values.ndim - 3))
+    return jnp.take_along_axis(values, index, axis=0)[0]
+
+
+def at_inverse_depth(values: Array, candidates: Array, inverse_depth: Array) -> Array:
+    """The values of the planes, interpolated linearly at each pixel's inverse depth."""
+    place = (inverse_depth - candidates[0]) / (candidates[1] - candidates[0])
+    index = jnp.clip(jnp.floor(place).astype(int), 0, len(candidates) - 2)
+    share = jnp.clip(place - index.astype(place.dtype), 0, 1)
+    share = share.reshape(*share.shape, *(1,) * (values.ndim - 3))
+    return (1 - share) * at_index(values, index) + share * at_index(values, index + 1)

@@ -1,0 +1,355 @@
+"""The all-in-focus image and the depth of a scene, from images at several focus distances."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, final, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jaxfx import depth as depths
+from jaxfx._arguments import check_lens
+from jaxfx._arrays import ArrayLike
+from jaxfx._checks import (
+    Number,
+    WholeNumber,
+    check,
+    check_image,
+    items,
+    number,
+    option,
+    whole_number,
+)
+from jaxfx._numerics import working_dtype
+from jaxfx._progress import Bar
+from jaxfx.fit._descent import End, check_success, descend, verdict
+from jaxfx.fit._lens_model import Effect
+from jaxfx.fit._stack_planes import (
+    WINDOW,
+    Planes,
+    at_inverse_depth,
+    best,
+    compared,
+)
+from jaxfx.fit._stack_search import StackResidual
+from jaxfx.lens import ThinLens
+
+
+# What a stack must meet to be called a success, all ratios: the largest standard error of a
+# depth that is determined, over the depth; the least share of pixels that are; the least
+# variation from image to image that is explained; the largest difference in exposure. Looser
+# bounds trust stacks that show nothing, tighter ones doubt those of which half is even.
+_MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.5, 0.05
+# Pixels of defocus from one candidate plane to the next. Coarser planes miss the least energy,
+# finer ones cost time alone.
+_STEP = 0.35
+# Most candidate planes: the memory is that of as many images.
+_MOST_PLANES = 96
+# Pixels. Lenses whose circles of confusion differ less from one another tell no depth.
+_LEAST_DIFFERENCE = 0.5
+
+
+@final
+class FocalStackFit(eqx.Module):
+    """The image and depth that `focal_stack` found, and how sure they are.
+
+    - `image`: height width channel, all in focus, linear radiance.
+    - `depth`: height width, scene units. Where it is not `determined` it is that of a pixel
+      nearby.
+    - `standard_errors`: `"depth"`, height width, in scene units, from the images alone, without
+      the prior: inf where they tell nothing. From the residuals in a window of some 14 pixels;
+      errors of pixels more than 5 apart are taken for independent. That a window shows two
+      surfaces is not in it.
+    - `determined`: height width, where the standard error is below a tenth of the depth.
+    - `share`: the share of pixels, a ratio, that are determined.
+    - `explained`: the share, a ratio, of what varies from image to image that is explained: 1
+      leaves no difference.
+    - `exposures`: photograph, the mean of each image over the mean of all, a ratio.
+    - `losses`: the mean squared residual at the start of the search through the effect and
+      after every step, in units of the noise.
+    - `result`: optimistix' verdict on that search, one of its `RESULTS`.
+    """
+
+    image: Float[Array, "height width channel"]
+    depth: Float[Array, "height width"]
+    standard_errors: dict[str, Float[Array, "height width"]]
+    determined: Bool[Array, "height width"]
+    share: Float[Array, ""]
+    explained: Float[Array, ""]
+    exposures: Float[Array, " photograph"]
+    losses: Float[Array, " steps"]
+    result: optx.RESULTS
+
+    @property
+    def doubt(self) -> str:
+        """Why the depth is not to be trusted, as a sentence; empty for a success."""
+        ended = optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        if not any(self.result == each for each in ended):
+            return str(self.result)
+        uneven = float(jnp.max(jnp.abs(self.exposures - 1)))
+        if not uneven <= _MOST_EXPOSURE:
+            return f"The exposure differs by {100 * uneven:.0f} % between the images."
+        if not self.share >= _LEAST_SHARE:
+            return f"The images determine the depth of {100 * float(self.share):.0f} % of them."
+        if not self.explained >= _LEAST_EXPLAINED:
+            part = max(0.0, 100 * float(self.explained))
+            return f"Only {part:.0f} % of what varies between the images is explained."
+        return ""
+
+    @property
+    def success(self) -> bool:
+        """Whether the images determine the depth of enough pixels."""
+        return not self.doubt
+
+
+def focal_stack(
+    images: Sequence[Float[ArrayLike, "height width channel"]],
+    lenses: Sequence[ThinLens],
+    *,
+    min_depth: Number | None = None,
+    max_depth: Number | None = None,
+    effect: Effect = "scatter",
+    smoothness: Number = 1.0,
+    max_steps: WholeNumber = 24,
+    throw: bool = True,
+    progress: bool = False,
+) -> FocalStackFit:
+    """The all-in-focus image and the depth of a scene, from images focused at other distances.
+
+    The camera and the scene stand still, and the lenses are known. `standard_errors` and
+    `determined` of the result say of which pixels the images tell the depth.
+
+    **Arguments:**
+
+    - `images`: height width channel each, linear radiance, two or more of one exposure.
+    - `lenses`: one for each image, lengths in scene units; at least two focus distances.
+    - `min_depth`, `max_depth`: static; scene units, the depths between which it is sought. By
+      default half a step of inverse focus distance beyond the least and the largest.
+    - `effect`: the function of `jaxfx.dof` through which the search goes, `"scatter"` or
+      `"layered"`, which takes longer.
+    - `smoothness`: weight of the prior, a ratio: each bend of the inverse depth counts like a
+      difference of images as large as their noise where it is 0.05 pixels of defocus.
+    - `max_steps`: of the search through the effect; 0 ends with the planes, see below.
+    - `throw`: raise where the fit is no success; else `doubt` says why.
+    - `progress`: show a bar on stderr; it needs the extra `plot`.
+
+    **Returns:** a `FocalStackFit`.
+
+    **Raises:** `ValueError` for a single image, shapes or numbers that differ, an image that is
+    not finite, a lens that is none, lenses whose circles of confusion are alike, or a range
+    without depths. `RuntimeError` where the fit is no success and `throw` is true.
+
+    **Gradient:** none through the search: it stops at every step to report.
+
+    **Example:** a textured wall at 2.5, in focus in none of three images.
+
+    >>> import numpy as np
+    >>> from jaxfx import ThinLens, dof, fit
+    >>> wall = np.random.default_rng(0).random((24, 24, 1)).astype(np.float32)
+    >>> lenses = [ThinLens(0.3, focus, 60.0) for focus in (2.0, 3.0, 5.0)]
+    >>> depth = np.full((24, 24), 2.5, np.float32)
+    >>> images = [dof.scatter(wall, depth, lens) for lens in lenses]
+    >>> found = fit.focal_stack(images, lenses, max_steps=0)
+    >>> bool(abs(np.median(found.depth) - 2.5) < 0.1)
+    True
+
+    First candidate planes are compared, a third of a pixel of defocus apart. For each the image
+    that explains the stack best is a quotient of Fourier transforms, and the plane whose
+    residuals in a window are least gives a pixel its depth. Where that is not determined it is
+    filled as by `depth.fill`. From there image and inverse depth are searched for together, by
+    nonlinear conjugate gradients through the effect, with a pseudo-Huber loss, and a prior of
+    the same form on second differences of the inverse depth, which is less at edges of the
+    image. The standard error is that of Gauss and Newton, with the image solved for, from
+    derivatives of the residuals in the window and the residuals themselves.
+
+    Known limits: within the radius of a circle of confusion from an edge in depth, a window
+    shows two surfaces. A lens that breathes must be undone first.
+
+    Source: Zhou, Lin & Nayar 2009, the comparison of planes by Wiener quotients; Newey & West
+    1987, variances of sums whose terms depend on their neighbors. The search through the
+    effect, its prior and the bounds of success are our own.
+    """
+    stack, lenses = _checked(images, lenses)
+    option("focal_stack(effect=...)", effect, get_args(Effect))
+    smoothness = number(
+        "focal_stack(smoothness=...)", smoothness, lambda x: 0 <= x < math.inf, "0 or positive"
+    )
+    max_steps = whole_number(
+        "focal_stack(max_steps=...)", max_steps, lambda n: n >= 0, "an integer from 0"
+    )
+    strengths, foci = _lines(lenses)
+    low, high = _range(foci, min_depth, max_depth)
+    largest = _largest(strengths, foci, low, high)
+    count = math.ceil(strengths.mean() * (high - low) / _STEP) + 1
+    dtype = stack.dtype
+    candidates = jnp.linspace(low, high, min(max(count, 8), _MOST_PLANES), dtype=dtype)
+    with Bar(progress, "fit") as bar:
+        pad = math.ceil(largest / 2) + 2
+        lines = (jnp.asarray(strengths, dtype), jnp.asarray(foci, dtype))
+        planes = compared(stack, *lines, candidates, pad)
+        bar.step(planes=str(len(candidates)))
+        start = best(planes, candidates)
+        error = _errors(planes, candidates, start)
+        # An image that fits is seen through planes that fit, told or not.
+        image = at_inverse_depth(planes.image, candidates, start)
+        energy = at_inverse_depth(planes.energy, candidates, start)
+        start = _filled(start, error, stack)
+        residual = _residual(
+            stack, lenses, image, energy, candidates, start, smoothness, effect
+        )
+        unknowns = {
+            "shift": jnp.zeros(start.shape, float),
+            "change": jnp.zeros(residual.image.shape, float),
+        }
+        if max_steps:
+            solver = optx.NonlinearCG(rtol=1e-3, atol=1e-3)
+            end = descend(residual, unknowns, solver=solver, max_steps=max_steps, bar=bar)
+        else:
+            loss = jnp.mean(residual(unknowns) ** 2)
+            end = End(unknowns, [loss], optx.RESULTS.successful)
+    image, inverse_depth = residual.values(end.unknowns)
+    left = jnp.mean((residual.drawn(image, inverse_depth) - stack) ** 2)
+    varies = jnp.mean((stack - jnp.mean(stack, axis=0, keepdims=True)) ** 2)
+    means = jnp.mean(stack, axis=(1, 2, 3))
+    error = _errors(planes, candidates, inverse_depth)
+    is_determined = error < _MOST_ERROR * inverse_depth
+    fitted = FocalStackFit(
+        image=image,
+        depth=1 / inverse_depth,
+        standard_errors={"depth": error / inverse_depth**2},
+        determined=is_determined,
+        share=jnp.mean(is_determined.astype(dtype)),
+        explained=jnp.where(varies > 0, 1 - left / varies, -jnp.inf),
+        exposures=means / jnp.mean(means),
+        losses=jnp.stack(end.losses),
+        result=verdict(end.result),
+    )
+    if throw:
+        check_success(fitted, "focal_stack", "depth")
+    return fitted
+
+
+def _checked(images: Any, lenses: Any) -> tuple[Array, tuple[ThinLens, ...]]:
+    """The images, stacked, and their lenses; or a `ValueError`."""
+    images = items("focal_stack(images)", images, "a sequence of images")
+    if len(images) < 2:
+        raise ValueError(f"`focal_stack(images)` must be two or more, got {len(images)}.")
+    checked = []
+    for index, image in enumerate(images):
+        name = f"focal_stack(images[{index}])"
+        read = check_image(name, image)
+        check(name, read, np.isfinite, "finite")
+        if checked and read.shape != checked[0].shape:
+            raise ValueError(
+                f"`{name}` must have the first image's shape {checked[0].shape}, "
+                f"got {read.shape}."
+            )
+        checked.append(read.astype(working_dtype(read.dtype)))
+    lenses = tuple(items("focal_stack(lenses)", lenses, "a sequence of lenses"))
+    if len(lenses) != len(checked):
+        raise ValueError(
+            f"`focal_stack(lenses)` must be one for each of {len(checked)} images, "
+            f"got {len(lenses)}."
+        )
+    for index, lens in enumerate(lenses):
+        name = f"focal_stack(lenses[{index}])"
+        if not isinstance(lens, ThinLens):
+            raise ValueError(f"`{name}` must be a ThinLens, got {type(lens).__name__}.")
+        check_lens(name, lens)
+    return jnp.stack([image.astype(checked[0].dtype) for image in checked]), lenses
+
+
+def _lines(lenses: tuple[ThinLens, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Each lens' pixels of defocus per unit of inverse depth, and inverse focus distance."""
+    strengths = [float(lens.aperture) * float(lens.focal_pixels) for lens in lenses]
+    return np.array(strengths), np.array([1 / float(lens.focus_distance) for lens in lenses])
+
+
+def _range(foci: np.ndarray, min_depth: Any, max_depth: Any) -> tuple[float, float]:
+    """The inverse depths between which the search goes."""
+    is_depth = lambda x: 0 < x < math.inf
+    named = {"min_depth": min_depth, "max_depth": max_depth}
+    given = {
+        name: 1 / number(f"focal_stack({name}=...)", value, is_depth, "positive and finite")
+        for name, value in named.items()
+        if value is not None
+    }
+    first, last = float(foci.min()), float(foci.max())
+    # Lenses that are alike are refused later, by another name.
+    step = (last - first) / max(1, len(foci) - 1) / 2 or first / 2
+    low: float = given.get("max_depth", max(first - step, first / 4))
+    high: float = given.get("min_depth", last + step)
+    if not low < high:
+        raise ValueError(
+            "`focal_stack(min_depth=...)` must be less than `max_depth`, "
+            f"got {1 / high:.4g} and {1 / low:.4g}."
+        )
+    return low, high
+
+
+def _largest(strengths: np.ndarray, foci: np.ndarray, low: float, high: float) -> float:
+    """The largest circle of confusion in pixels; `ValueError` where lenses do not differ."""
+    ends = np.abs(strengths * (foci - np.array([[low], [high]])))
+    difference = np.ptp(ends, axis=1).max()
+    if not difference > _LEAST_DIFFERENCE:
+        raise ValueError(
+            "`focal_stack(lenses)` must have circles of confusion that differ by more than "
+            f"{_LEAST_DIFFERENCE} pixels from one image to another, got {difference:.3g}."
+        )
+    return float(ends.max())
+
+
+def _errors(planes: Planes, candidates: Array, inverse_depth: Array) -> Array:
+    """The standard error of the inverse depth at each pixel; inf where nothing tells it."""
+    slope, spread = (
+        at_inverse_depth(values, candidates, inverse_depth)
+        for values in (planes.slope, planes.spread)
+    )
+    is_told = slope > 0
+    return jnp.where(is_told, jnp.sqrt(spread) / jnp.where(is_told, slope, 1), jnp.inf)
+
+
+def _filled(inverse_depth: Array, error: Array, stack: Array) -> Array:
+    """The inverse depth, undetermined pixels filled from others, if there are any."""
+    is_known = error < _MOST_ERROR * inverse_depth
+    if not bool(is_known.any()):
+        return inverse_depth
+    guide = jnp.mean(stack, axis=0)
+    guide = guide / jnp.maximum(jnp.max(guide), jnp.finfo(guide.dtype).tiny)
+    return 1 / depths.fill(jnp.where(is_known, 1 / inverse_depth, 0), guide).depth
+
+
+def _residual(
+    stack: Array,
+    lenses: tuple[ThinLens, ...],
+    image: Array,
+    energy: Array,
+    candidates: Array,
+    start: Array,
+    smoothness: float,
+    effect: Effect,
+) -> StackResidual:
+    """What the search makes small, from the planes' image, energy and depth."""
+    dtype = stack.dtype
+    level = jnp.sqrt(jnp.mean(stack * stack))
+    area = 2 * math.pi * WINDOW**2 * len(stack) * stack.shape[-1]
+    noise = jnp.sqrt(jnp.median(energy) / area) + 1e-3 * level
+    strengths, foci = _lines(lenses)
+    largest = _largest(strengths, foci, float(candidates[0]), float(candidates[-1]))
+    return StackResidual(
+        images=stack,
+        lenses=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(dtype), *lenses),
+        image=image,
+        inverse_depth=start,
+        bounds=(candidates[0], candidates[-1]),
+        strength=jnp.mean(jnp.asarray(strengths, dtype)),
+        noise=jnp.maximum(noise, jnp.finfo(dtype).tiny),
+        level=jnp.maximum(level, jnp.finfo(dtype).tiny),
+        smoothness=jnp.asarray(smoothness, dtype),
+        effect=effect,
+        max_coc=math.ceil(largest),
+    )
