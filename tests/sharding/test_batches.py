@@ -26,7 +26,7 @@ NO_BATCH = {
     *("io.srgb_from_linear", "io.write_png"),
     *("scene.default_camera", "scene.default_lights", "scene.depth", "scene.from_trimesh"),
     *("scene.gbuffer", "scene.gbuffer_along", "scene.load", "scene.material_ids"),
-    *("scene.object_ids", "scene.occlusion"),
+    *("scene.object_ids", "scene.occlusion", "fit.focal_stack"),
     *("scene.plan_views", "scene.still_life", "scene.transfer", "scene.visible"),
     *("tradeoff.measure", "tradeoff.pareto", "tradeoff.plot", "tradeoff.save"),
 }
