@@ -46,7 +46,7 @@ def lens_of_starts(count):
         start = ThinLens(aperture, 2.8, 40.0)
         return fit.dof(photograph, image, DEPTH, start, max_coc=4, max_steps=3, throw=False)
 
-    return fitted, (np.linspace(0.15, 0.27, count),)
+    return fitted, (np.linspace(0.2, 0.3, count),)
 
 
 def cameras(count):
