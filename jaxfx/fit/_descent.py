@@ -35,6 +35,11 @@ class Verdict(_Item):
     """One of `optimistix.RESULTS`, equal to it, that prints as a sentence, a success too."""
 
     def __repr__(self) -> str:
+        if self == optx.RESULTS.nonlinear_max_steps_reached:
+            return (
+                "The search took its maximum number of steps: raise `max_steps`, begin nearer, "
+                "or seek fewer parameters."
+            )
         return optx.RESULTS[self] or "The search converged."
 
 

@@ -93,24 +93,24 @@ def occlusion(
     rng, step = np.random.default_rng(seed), max(_RAYS_PER_BLOCK // ray_count, 1)
     for first in range(0, len(position), step):
         block = slice(first, first + step)
-        ways = _about(normal[block], ray_count, rng)
-        start = np.broadcast_to(position[block, None], ways.shape).reshape(-1, 3)
-        end = start + _REACH * scene.radius * ways.reshape(-1, 3)
-        is_blocked = ~embree.unobstructed(scene, start, end).reshape(ways.shape[:2])
-        found[block] -= (_functions(ways, count) * is_blocked[..., None]).mean(axis=1)
+        directions = _about(normal[block], ray_count, rng)
+        start = np.broadcast_to(position[block, None], directions.shape).reshape(-1, 3)
+        end = start + _REACH * scene.radius * directions.reshape(-1, 3)
+        is_blocked = ~embree.unobstructed(scene, start, end).reshape(directions.shape[:2])
+        found[block] -= (_functions(directions, count) * is_blocked[..., None]).mean(axis=1)
     image = np.zeros((height, width, count), np.float32)
     image[is_surface] = found
     return jnp.asarray(image)
 
 
-def _functions(way: Any, count: int) -> Float[np.ndarray, "... count"]:
+def _functions(direction: Any, count: int) -> Float[np.ndarray, "... count"]:
     """The first spherical harmonics of unit vectors."""
-    return np.stack(polynomials(way)[:count], axis=-1) * FACTORS[:count]
+    return np.stack(polynomials(direction)[:count], axis=-1) * FACTORS[:count]
 
 
 def _about(
     normal: Float[np.ndarray, "pixel 3"], count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "pixel way 3"]:
+) -> Float[np.ndarray, "pixel direction 3"]:
     """Directions about each normal, spread by the cosine.
 
     One even pattern in a square, moved by another offset in each pixel, is mapped to the disc

@@ -12,7 +12,7 @@ import jaxfx
 
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGES = ("index", "lenses", "recipes", "pytorch")
+PAGES = ("index", "lenses", "recipes", "pytorch", "relight")
 NEEDS = {"pytorch": "torch"}
 
 pytestmark = pytest.mark.full
