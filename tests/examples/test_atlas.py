@@ -136,7 +136,7 @@ PARTS = {
     *("Accumulation", "binomial_weights", "linear_taps", "Candidates", "Receivers"),
     *("candidates", "receivers", "light_cameras", "Choice", "Hit", "choose"),
     *("MovingShadow", "RelightState", "Synthesis", "FilledCache", "LinearTaps"),
-    *("capture_normals", "shade", "Iris", "peel"),
+    *("capture_normals", "shade", "Iris", "peel", "mirrored", "refracted", "fresnel"),
 }
 
 
