@@ -153,7 +153,7 @@ def test_a_scale_may_be_a_fraction(photograph, main):
             "--disparity-shift must be without --baseline",
         ),
         (("color.png", "notes.npz"), r"`notes.npz` must have one array, .* got \[\]"),
-        (("two\nlines.png", "depth.png"), "`two lines.png` must be a PNG, JPEG, EXR or Radiance file"),
+        (("two\nlines.png", "depth.png"), "`two lines.png` must be a PNG, JPEG, EXR or"),
         (("color.png", "depth.png", "--focus", "1", "--aperture", "1e6"), "exceeds the image"),
         (("color.png", "depth.png", "--behind", "x"), "must be an OpenEXR file"),
         (
