@@ -149,12 +149,12 @@ def focal_stack(
 
     >>> import numpy as np
     >>> from jaxfx import ThinLens, dof, fit
-    >>> wall = np.random.default_rng(0).random((24, 24, 1)).astype(np.float32)
-    >>> lenses = [ThinLens(0.3, focus, 60.0) for focus in (2.0, 3.0, 5.0)]
-    >>> depth = np.full((24, 24), 2.5, np.float32)
+    >>> wall = np.random.default_rng(0).random((32, 32, 1)).astype(np.float32)
+    >>> lenses = [ThinLens(0.3, focus, 180.0) for focus in (2.0, 3.0, 5.0)]
+    >>> depth = np.full((32, 32), 2.5, np.float32)
     >>> images = [dof.scatter(wall, depth, lens) for lens in lenses]
     >>> found = fit.focal_stack(images, lenses, max_steps=0)
-    >>> bool(abs(np.median(found.depth) - 2.5) < 0.1)
+    >>> bool(abs(np.median(found.depth) - 2.5) < 0.01)
     True
 
     First candidate planes are compared, a third of a pixel of defocus apart. For each the image
@@ -167,7 +167,8 @@ def focal_stack(
     derivatives of the residuals in the window and the residuals themselves.
 
     Known limits: within the radius of a circle of confusion from an edge in depth, a window
-    shows two surfaces. A lens that breathes must be undone first.
+    shows two surfaces. Where all circles are below some 4 pixels the depth is biased, by 5 % in
+    this example with a third of the focal length. A lens that breathes must be undone first.
 
     Source: Zhou, Lin & Nayar 2009, the comparison of planes by Wiener quotients; Newey & West
     1987, variances of sums whose terms depend on their neighbors. The search through the
