@@ -1,4 +1,4 @@
-"""What devices tell each other, and the memory of each, by the number of devices.
+"""Collectives, the bytes that they move, and memory per device, by the number of devices.
 
 `python -m benchmarks.collectives` compiles each pattern of `docs/devices.md` for 1, 2, 4 and 8
 devices of one CPU and prints a table: collectives of the compiled program, the bytes that they

@@ -1,4 +1,4 @@
-"""What errors in depth cost an image: `dof.layered` with a network's usual mistakes.
+"""Errors of `dof.layered` under wrong depth: the usual mistakes of networks.
 
     python -m benchmarks.depth_errors
 

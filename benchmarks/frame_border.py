@@ -1,4 +1,4 @@
-"""What `layered` loses at the frame, by what it takes to lie beyond, in decibels.
+"""PSNR of `layered` near the frame, by what is assumed to lie beyond it.
 
 `python -m benchmarks.frame_border [MESH ...]` prints a row for each of three foci and two
 apertures of every scene of `hidden_layers`: the PSNR to the multi-pass reference with the last

@@ -29,7 +29,7 @@ KINDS = {
 
 
 def of_mitsuba(mesh, camera, light, size, material, kind):
-    """What the pixels of one material show by way of it, and which pixels those are."""
+    """Mitsuba's radiance in the pixels of one mirror or clear material, and their mask."""
     shapes = truth.shapes(mesh)
     world = mi.load_dict({"type": "scene", **shapes, "light": truth.emitter(light)})
     if kind == "conductor":

@@ -160,7 +160,7 @@ def direct(mesh, camera, light, size, *, shadows):
 
 
 def bounced(mesh, camera, light, size, samples, *, seed=0, bounces=1):
-    """The image of so many bounces of indirect light, and its standard error, by paths."""
+    """Mitsuba's image of `bounces` bounces of indirect light, and its standard error."""
     world = mi.load_dict({"type": "scene", **shapes(mesh), "light": emitter(light)})
     path = lambda depth: mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
     once, more = path(2), path(2 + bounces)

@@ -31,7 +31,7 @@ Behind = _Given | Sequence[_Given | Literal["peel"]] | Literal["peel"] | None
 
 
 class Layer(NamedTuple):
-    """What `layered` is given of one layer; the lens is one that `jax.jit` takes."""
+    """One layer as given to `layered`; the lens is one that `jax.jit` takes."""
 
     image: Float[Array, "height width channel"]
     depth: Float[Array, "height width"]

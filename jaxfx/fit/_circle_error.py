@@ -1,4 +1,4 @@
-"""What an effect draws wrong, as an error of its circles of confusion.
+"""Variances of a fitted lens by model error: wrong circles of confusion of an effect.
 
 Noise is not what makes a fitted lens wrong. An effect draws a slanted surface, a small circle
 or what an edge hides unlike a lens does, and the search makes up for it by another lens, so

@@ -30,7 +30,7 @@ _NOISE = 1e-2
 
 
 class Planes(NamedTuple):
-    """What each plane says of each pixel, planes along the first axis.
+    """Residual, slope and image per pixel under each candidate plane, planes first.
 
     - `energy`: sum of squared residuals in the window, squared units of radiance.
     - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
@@ -79,7 +79,7 @@ def compared(
         return image_of(spectra - blurs * sharp[None]), image_of(sharp)
 
     def projector(inverse_depth: Array) -> Array:
-        """What a plane leaves of the images: a matrix at each frequency."""
+        """The matrix, at each frequency, from images to residuals under one plane."""
         circles = jnp.abs(strengths * (foci - inverse_depth))
         blurs = jax.vmap(lambda c: disc(c * frequency))(circles)
         power = jnp.sum(blurs * blurs, axis=0) + _NOISE

@@ -92,5 +92,5 @@ class StackResidual(eqx.Module):
 
 
 def _eased(x: Array) -> Array:
-    """What has the pseudo-Huber loss as its square: x where small, a root of it where large."""
+    """Root of the pseudo-Huber loss: about x where small, about sqrt(2 abs(x)) where large."""
     return x * jnp.sqrt(2 / (1 + jnp.sqrt(1 + x * x)))

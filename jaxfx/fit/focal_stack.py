@@ -334,7 +334,7 @@ def _residual(
     smoothness: float,
     effect: Effect,
 ) -> StackResidual:
-    """What the search makes small, from the planes' image, energy and depth."""
+    """The residual of the search, which starts at the planes' image and inverse depth."""
     dtype = stack.dtype
     level = jnp.sqrt(jnp.mean(stack * stack))
     area = 2 * math.pi * WINDOW**2 * len(stack) * stack.shape[-1]

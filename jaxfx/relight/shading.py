@@ -219,8 +219,10 @@ class Surface(NamedTuple):
 
 
 def ggx_kinds(gbuffer: GBuffer) -> int:
-    """What a pixel of a cache has, or may have where it is traced: 0 no GGX, 1 glTF's, 2 that
-    which conserves energy too."""
+    """The GGX shaders of a cache: 0 none, 1 that of glTF, 2 the one that conserves energy too.
+
+    A traced cache may hold all.
+    """
     if not is_concrete(gbuffer.shader):
         return 2
     shader = np.asarray(gbuffer.shader)
@@ -228,8 +230,10 @@ def ggx_kinds(gbuffer: GBuffer) -> int:
 
 
 def response(facing: _Scalars, exponents: _Scalars) -> Float[Array, "height width 2"]:
-    """What a highlight returns of white light from everywhere, by N.V: a share that `specular`
-    multiplies, and one besides."""
+    """Directional albedo of a highlight under white light from everywhere, by N.V.
+
+    Two ratios: the first is multiplied by `specular`, the second is added.
+    """
     lobe = mean_lobe(facing, jnp.sqrt(roughness_squared(exponents)))
     return jnp.stack([lobe.specular, lobe.grazing], axis=-1)
 
@@ -515,7 +519,7 @@ def _by_coefficient(
     light: SphericalHarmonicsLight | EnvironmentLight,
     visibility: Float[Array, "height width coefficient"],
 ) -> _Vectors:
-    """What a white Lambert surface shows of light from all around, by `scene.occlusion`."""
+    """Radiance of a white Lambert surface under light from all around, by `scene.occlusion`."""
     coefficients = light.coefficients.astype(visibility.dtype)
     if isinstance(light, EnvironmentLight):
         turn = light.world_from_image.astype(visibility.dtype)

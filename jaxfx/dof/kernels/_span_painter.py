@@ -167,7 +167,7 @@ class Blocks:
         shape: tuple[int, int],
         dtype: DTypeLike,
     ) -> Float[Array, "stack_times_value height width"]:
-        """What `write(block, steps)` adds to the steps of each block, painted in the frame.
+        """Images of the spans whose steps `write(block, steps)` adds, block by block.
 
         `is_held` is the mask of the blocks that hold discs; only these are visited. `shape` is
         the number of stacks of values (values, tangents) and of values per stack.
@@ -350,7 +350,7 @@ class _End(NamedTuple):
     by_radius: Array | None
 
     def of(self, start: tuple[Array, Array]) -> Float[Array, "disc step"]:
-        """What this end writes, as one that has no side and no weight."""
+        """The steps that this end writes, without its sign and the weight of its disc."""
         whole, part = start
         return self.whole * whole + self.cut[:, None] * part
 
@@ -363,7 +363,7 @@ class _End(NamedTuple):
 def _stepped(
     value: Float[Array, "disc value"],
 ) -> tuple[Float[Array, "disc step"], Float[Array, "disc step"]]:
-    """What the start of a span adds to the running sum, and to the sum's correction.
+    """A disc's steps at the start of a span: in the running sum, and in its correction.
 
     The correction is for the pixel in which the span starts, which it covers in part.
     """
