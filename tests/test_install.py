@@ -13,7 +13,7 @@ import pytest
 pytestmark = pytest.mark.full
 
 ROOT = Path(__file__).parents[1]
-PLAIN = {"jax", "numpy", "equinox", "jaxtyping", "optimistix"}
+PLAIN = {"jax", "numpy", "equinox", "jaxtyping", "optimistix", "scipy"}
 
 
 def run(*command, cwd=ROOT):

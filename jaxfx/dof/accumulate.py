@@ -58,7 +58,7 @@ def accumulate(
       disc's sequence that lie in it.
     - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
       pixel.
-    - `seed`: static; an integer from 0, turns the sequence to another of its kind.
+    - `seed`: static; an integer from 0, scrambles the sequence in another way.
     - `progress`: show a bar on stderr; it needs the extra `plot`.
 
     **Returns:** an `Accumulation`: `image`, height width channel, in the renderer's float type
@@ -83,8 +83,8 @@ def accumulate(
 
     All cameras share the plane in focus.
 
-    Source: Haeberli & Akeley 1990, the accumulation buffer. The sequence is Roberts' 2018
-    generalization of the golden ratio to four dimensions.
+    Source: Haeberli & Akeley 1990, the accumulation buffer. The sequence is Sobol's of 1967 in
+    four dimensions, scrambled (Matousek 1998), by SciPy.
     """
     check_camera("accumulate(camera)", camera, PinholeCamera)
     if not isinstance(lens, ThinLens):
@@ -133,11 +133,11 @@ def lens_samples(
     samples: int, seed: int = 0
 ) -> tuple[Float[np.ndarray, "samples 2"], Float[np.ndarray, "samples 2"]]:
     """Points on a disc of diameter 1, and offsets within a pixel, each in [-1/2, 1/2]."""
-    # The root of x**5 = x + 1: its powers are as far from fractions as four numbers can be.
-    ratio = 1.1673039782614187
-    steps = ratio ** -np.arange(1.0, 5.0)
-    start = np.random.default_rng(seed).random(4) if seed else np.full(4, 0.5)
-    u = (start + np.arange(samples)[:, None] * steps) % 1
+    # Imported here: it takes half a second, which `import jaxfx.dof` should not.
+    from scipy.stats import qmc
+
+    sequence = qmc.Sobol(4, rng=np.random.default_rng(seed))
+    u = sequence.random_base2(max(samples - 1, 1).bit_length())[:samples]
     radius, angle = np.sqrt(u[:, 0]) / 2, 2 * np.pi * u[:, 1]
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1), u[:, 2:] - 0.5
 
