@@ -22,7 +22,7 @@ MIDDLE, HALF = 1.5, 4 / 3
 COLUMN = np.arange(SIZE[1])
 
 
-def passes(planes, samples=400):
+def passes(planes, samples=512):
     """The mean over a lens of planes (image, alpha, defocus), front to back: one row of it.
 
     A plane is read between its pixels, along a row: each is the same in all rows.
