@@ -24,7 +24,7 @@ from jaxfx.lens import ThinLens
 _PILOT = 16
 # Passes for each one that random points would need in the mean. Where an image changes over the
 # lens faster than the points are close, their error is that of random ones, and a single set of
-# 5 to 12 points errs by 1.3 times the mean of all sets in 5 % of random waves, 1.5 times in 1 %.
+# 5 to 12 errs by 1.3 times the mean of all sets in 5 % of random waves, by 1.5 times in 1 %.
 _MARGIN = 2
 
 
