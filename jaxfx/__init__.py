@@ -47,7 +47,7 @@ from jaxfx.light import (
 from jaxfx.transfer import Transfer
 
 
-__version__ = "0.1.0.dev0"
+__version__ = "0.1.0"
 
 __all__ = [
     "AmbientLight",
