@@ -130,7 +130,7 @@ def layered(
     focus that is "over".
 
     A guessed second layer repeats pixels from next to an edge. On 18 images of three scenes,
-    those that `peel` was made on, it gains 1.05 dB on average and loses nothing.
+    those that `peel` was made on, it gains 1.08 dB on average and loses 0.01 at most.
 
     Known limits: what no layer shows is guessed from its surroundings; beyond the frame the
     last pixels are repeated, so that the border is some 3 dB worse than the inside. Through
