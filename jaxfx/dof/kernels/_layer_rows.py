@@ -17,7 +17,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Float, Int, Num
 
 from jaxfx._loops import fori_loop, scan
 from jaxfx._numerics import clip01
@@ -27,6 +28,7 @@ from jaxfx.dof.kernels._compositing import (
     Filling,
     begin_reading,
     fill,
+    lit,
     nothing_filled,
     read_slice,
 )
@@ -36,11 +38,13 @@ from jaxfx.dof.sprites import segment_integral
 
 # Slices per group: 24 planes of sums, of RGB. With 8, XLA keeps the shares of every tap in
 # memory (three times the time at a radius of 32); with fewer, more groups compute coverages.
-GROUP = 6
+GROUP = 4
+# Rows of offsets at a time.
+ROWS = 9
 
 
 @ft.partial(jax.custom_jvp)
-def _half_width(radius: Float[Array, "*size"], row: Int[Array, ""]) -> Float[Array, "*size"]:
+def _half_width(radius: Float[Array, "*size"], row: Num[Array, ""]) -> Float[Array, "*size"]:
     """Mean half-width of each disc in a row of pixels, `row` rows from its centre."""
     return _half_width_and_slope(radius, row, slope=False)[0]
 
@@ -84,12 +88,11 @@ def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
     return runs
 
 
-def _add_group(visit, first, size, reach, k, state):
-    return visit(first + k * size, size, reach, state)
-
-
 def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state: Any) -> Any:
-    """Fold `visit(sheet, number, first, count, reach, state)` over groups, from the front."""
+    """Fold `visit(sheet, number, first, arriving, reach, state)` over groups, from the front.
+
+    `first` is the number of the group's first slice, `arriving` are the sums of each of them.
+    """
     for number in range(len(sheets.radius)):
         sheet = jax.tree.map(lambda x, n=number: x[n], sheets)
         if extent.slices is None:
@@ -98,12 +101,39 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
             runs = [(first, -(-slices // GROUP), GROUP, extent.reach)]
         else:
             runs = _groups(extent, extent.slices)
-        for first, groups, size, reach in runs:
+        wide = _padded(extent, sheet)
+        for start, groups, size, reach in runs:
+
+            def add_group(k, state, run=(start, size, reach), sheet=sheet, wide=wide, n=number):
+                start, size, reach = run
+                first = start + k * size
+                arriving = _arriving(extent, wide, first, size, reach)
+                return visit(sheet, n, first, arriving[:, : len(sheet.value)], reach, state)
+
             # One run after the other, or all of them would take memory at once.
-            sheet, state = jax.lax.optimization_barrier((sheet, state))
-            add = ft.partial(_add_group, ft.partial(visit, sheet, number), first, size, reach)
-            state = fori_loop(0, groups, add, state)
+            sheet, wide, state = jax.lax.optimization_barrier((sheet, wide, state))
+            state = fori_loop(0, groups, add_group, state)
     return state
+
+
+def _turns(reach: int) -> tuple[int, int]:
+    """How many times as many rows of offsets are visited at once."""
+    offsets = 2 * reach + 1
+    turns = -(-offsets // ROWS)
+    return turns, -(-offsets // turns)
+
+
+def _padded(extent: Extent, sheet: Sheets) -> Sheets:
+    """A sheet as wide as any offset goes, for the last turn too, of an even number of values."""
+    beside = across_of(extent.reach) - extent.reach
+    below = _turns(extent.reach)[0] - 1  # the most rows that only fill up a turn
+    pad = lambda x, even=0: jnp.pad(
+        x, [(0, even)] * (x.ndim - 2) + [(0, below), (beside, beside)]
+    )
+    value, radius, tilt, place = sheet
+    value = pad(jnp.where(value[-1:] > 0, value, 0), len(value) % 2)
+    radius = pad(radius)
+    return Sheets(value, jnp.where(radius > 0, radius, 1), pad(tilt), pad(place))
 
 
 def _each_column(add: Callable[..., Any], sums: Array, across: int) -> Array:
@@ -120,48 +150,81 @@ def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> 
     return jax.lax.dynamic_slice_in_dim(x, start, size, axis=-1, allow_negative_indices=False)
 
 
+def _views(x: Array, axis: int, count: int) -> Array:
+    """`count` windows along an axis, each one element further on, along a new axis before it.
+
+    By reshaping a repeated axis, which to XLA is arithmetic on indices: nothing is copied where
+    a kernel reads the result.
+    """
+    x = jnp.moveaxis(x, axis, -1)
+    *outer, size = x.shape
+    repeated = jnp.broadcast_to(x[..., None, :], (*outer, count + 1, size))
+    # Rows one element longer than what is repeated: each begins one element later.
+    shifted = repeated.reshape(*outer, -1)[..., : count * (size + 1)]
+    windows = shifted.reshape(*outer, count, size + 1)[..., : size + 1 - count]
+    return jnp.moveaxis(windows, (-2, -1), (axis, axis + 1))
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _sums(terms: list[Array], axes: tuple[int, ...]) -> list[Array]:
+    """The sum of each array over the axes, in one loop of one kernel."""
+    zeros = [jnp.zeros((), x.dtype) for x in terms]
+    add = lambda x, y: [*map(jnp.add, x, y)]
+    return jax.lax.reduce(terms, zeros, add, axes)
+
+
+@_sums.defjvp
+def _(axes, primals, tangents):
+    return _sums(*primals, axes), _sums(*tangents, axes)
+
+
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
 @ft.partial(jax.jit, static_argnames=("extent", "count", "reach"))
 def _arriving(
     extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
 ) -> Float[Array, "slice value height width"]:
-    """Sums of the sprites of each slice of a group, per pixel of the frame."""
-    far, across = extent.reach, across_of(reach)
-    height, width = (n - 2 * far for n in sheet.radius.shape)
-    wider = max(0, across - far)
-    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(wider, wider)])
-    value = pad(jnp.where(sheet.value[-1:] > 0, sheet.value, 0))
-    radius, tilt_x, tilt_y, place = (pad(x) for x in (sheet.radius, *sheet.tilt, sheet.place))
-    slices = (first + jnp.arange(count)).astype(place.dtype)[:, None, None]
+    """Sums of the sprites of each slice of a group, per pixel of the frame.
+
+    `sheet` is one of `_padded`.
+    """
+    across, dtype = across_of(reach), sheet.radius.dtype
+    (turns, rows), columns = _turns(reach), 2 * across + 1
+    above, beside = extent.reach - reach, across_of(extent.reach) - across
+    height = sheet.radius.shape[0] - 2 * extent.reach - _turns(extent.reach)[0] + 1
+    width = sheet.radius.shape[1] - 2 * across_of(extent.reach)
+    edge = jnp.asarray(np.arange(columns)[None, None, :, None] - across + 0.5, dtype)
 
     def turn(index, sums):
-        row = index - reach
-        at_row = ft.partial(
-            jax.lax.dynamic_slice_in_dim,
-            start_index=far - row,
-            slice_size=height,
-            axis=-2,
-            allow_negative_indices=False,
-        )
-        own, slant, turned, places, light = map(at_row, (radius, tilt_x, tilt_y, place, value))
-        span = _half_width(jnp.where(own > 0, own, 1), row)
+        def near(x):
+            start = above + index * rows, beside
+            size = height + rows - 1, width + columns - 1
+            return jax.lax.dynamic_slice(x, start, size, allow_negative_indices=False)
+
+        # From the row that lies above the pixel: its sprites reach down.
+        row = (reach - index * rows - jnp.arange(rows)).astype(dtype)
+        own, slant = (_views(near(x), 0, rows) for x in (sheet.radius, sheet.tilt[0]))
+        span = jax.vmap(_half_width)(own, row)
         moved = slant * span * span / 3
-        start, end, facing = moved - span, moved + span, 1 + turned * row.astype(own.dtype)
-        start, end, facing = jax.lax.optimization_barrier((start, end, facing))
-
-        def add_tap(sums, column):
-            there = ft.partial(_columns, start=far + wider - column, size=width)
-            edge = 0.5 - column.astype(own.dtype)
-            cover = (clip01(there(end) + edge) - clip01(there(start) + edge)) * there(facing)
-            shares = cover[None] * share_of(there(places)[None] - slices)
-            return sums + shares[:, None] * there(light)[None], None
-
-        return _each_column(add_tap, sums, across)
+        ends = jax.lax.optimization_barrier((moved - span, moved + span))
+        start, end = (_views(x, 2, columns) for x in ends)
+        cover = clip01(end + edge) - clip01(start + edge)
+        there = lambda x: _views(_views(near(x), 0, rows), 2, columns)
+        facing, place = 1 + there(sheet.tilt[1]) * row[:, None, None, None], there(sheet.place)
+        light = [*map(there, sheet.value)]
+        terms = []
+        for k in range(count):
+            share = cover * (share_of(place - (first + k).astype(dtype)) * facing)
+            for x, y in zip(light[::2], light[1::2], strict=True):
+                terms.append(jax.lax.complex(share * x, share * y))
+        return sums + jnp.stack(_sums(terms, (0, 2)))
 
     # Made here, or those of all groups would be made at once.
-    value, zero = jax.lax.optimization_barrier((value, jnp.zeros((), value.dtype)))
-    nothing = jnp.broadcast_to(zero, (count, len(value), height, width))
-    return fori_loop(0, 2 * reach + 1, turn, nothing)
+    sheet, zero = jax.lax.optimization_barrier((sheet, jnp.zeros((), dtype)))
+    pairs = count * len(sheet.value) // 2
+    nothing = jnp.broadcast_to(jax.lax.complex(zero, zero), (pairs, height, width))
+    sums = fori_loop(0, turns, turn, nothing)
+    parts = jnp.stack([sums.real, sums.imag], axis=1)
+    return parts.reshape(count, -1, height, width)
 
 
 def _away(
@@ -173,19 +236,24 @@ def _away(
 
 
 def _filled(extent: Extent, sheets: Sheets) -> Filling:
-    def add(sheet, number, first, count, reach, state):
-        indices = number * APART + first + jnp.arange(count)
-        arriving = _arriving(extent, sheet, first, count, reach)
-        add_slice = lambda state, each: (fill(each[0], each[1], state), None)
-        return scan(add_slice, state, (indices, arriving), unroll=count)[0]
+    def add(_sheet, number, first, arriving, _reach, state):
+        for k, each in enumerate(arriving):
+            state = fill(number * APART + first + k, each, state)
+        return state
 
     return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
 
 
 def forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
     """Light and, last, how much of the lens it fills; then the same weighted."""
-    filling = _filled(extent, sheets)
-    return jnp.concatenate([filling.light, filling.late])
+
+    def add(_sheet, _number, _first, arriving, _reach, state):
+        for each in arriving:
+            state = lit(each, *state)[:2]
+        return state
+
+    nothing = nothing_filled(extent, sheets).light
+    return jnp.concatenate(_each_group(extent, sheets, add, (nothing, nothing)))
 
 
 def tangent(
@@ -201,17 +269,13 @@ def adjoint(
     """The transpose of `tangent`."""
     reading = begin_reading(_filled(extent, sheets), bar)
 
-    def read(sheet, number, first, count, reach, state):
+    def read(sheet, number, first, arriving, reach, state):
         bars, carry = state
-        indices = number * APART + first + jnp.arange(count)
-        arriving = _arriving(extent, sheet, first, count, reach)
-
-        def read_next(carry, each):
-            seen, carry = read_slice(reading, each[0], each[1], carry)
-            return carry, seen
-
-        carry, bar = scan(read_next, carry, (indices, arriving), unroll=count)
-        found = _read_back(extent, sheet, first, reach, bar)
+        seen = []
+        for k, each in enumerate(arriving):
+            bar, carry = read_slice(reading, number * APART + first + k, each, carry)
+            seen.append(bar)
+        found = _read_back(extent, sheet, first, reach, jnp.stack(seen))
         bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
         return bars, carry
 
