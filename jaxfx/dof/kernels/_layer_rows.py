@@ -33,14 +33,15 @@ from jaxfx.dof.kernels._compositing import (
     read_slice,
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
+from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
 from jaxfx.dof.sprites import segment_integral
 
 
 # Slices per group: 24 planes of sums, of RGB. With 8, XLA keeps the shares of every tap in
 # memory (three times the time at a radius of 32); with fewer, more groups compute coverages.
-GROUP = 4
+GROUP = 3
 # Rows of offsets at a time.
-ROWS = 9
+ROWS = 8
 
 
 @ft.partial(jax.custom_jvp)
@@ -108,32 +109,26 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
                 start, size, reach = run
                 first = start + k * size
                 arriving = _arriving(extent, wide, first, size, reach)
-                return visit(sheet, n, first, arriving[:, : len(sheet.value)], reach, state)
+                return visit(sheet, n, first, arriving, reach, state)
 
             # One run after the other, or all of them would take memory at once.
-            sheet, wide, state = jax.lax.optimization_barrier((sheet, wide, state))
+            wide, state = jax.lax.optimization_barrier((wide, state))
             state = fori_loop(0, groups, add_group, state)
     return state
 
 
-def _turns(reach: int) -> tuple[int, int]:
-    """How many times as many rows of offsets are visited at once."""
-    offsets = 2 * reach + 1
-    turns = -(-offsets // ROWS)
-    return turns, -(-offsets // turns)
-
-
 def _padded(extent: Extent, sheet: Sheets) -> Sheets:
-    """A sheet as wide as any offset goes, for the last turn too, of an even number of values."""
+    """A sheet as wide as any offset goes, and as high as the last turn."""
     beside = across_of(extent.reach) - extent.reach
-    below = _turns(extent.reach)[0] - 1  # the most rows that only fill up a turn
-    pad = lambda x, even=0: jnp.pad(
-        x, [(0, even)] * (x.ndim - 2) + [(0, below), (beside, beside)]
-    )
-    value, radius, tilt, place = sheet
-    value = pad(jnp.where(value[-1:] > 0, value, 0), len(value) % 2)
-    radius = pad(radius)
-    return Sheets(value, jnp.where(radius > 0, radius, 1), pad(tilt), pad(place))
+    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, _below(extent)), (beside,) * 2])
+    radius = pad(sheet.radius)
+    value = pad(jnp.where(sheet.value[-1:] > 0, sheet.value, 0))
+    return Sheets(value, jnp.where(radius > 0, radius, 1), pad(sheet.tilt), pad(sheet.place))
+
+
+def _below(extent: Extent) -> int:
+    """The most rows of offsets that only fill up a turn."""
+    return 2 * in_turns(2 * extent.reach + 1, ROWS)[0]
 
 
 def _each_column(add: Callable[..., Any], sums: Array, across: int) -> Array:
@@ -150,34 +145,6 @@ def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> 
     return jax.lax.dynamic_slice_in_dim(x, start, size, axis=-1, allow_negative_indices=False)
 
 
-def _views(x: Array, axis: int, count: int) -> Array:
-    """`count` windows along an axis, each one element further on, along a new axis before it.
-
-    By reshaping a repeated axis, which to XLA is arithmetic on indices: nothing is copied where
-    a kernel reads the result.
-    """
-    x = jnp.moveaxis(x, axis, -1)
-    *outer, size = x.shape
-    repeated = jnp.broadcast_to(x[..., None, :], (*outer, count + 1, size))
-    # Rows one element longer than what is repeated: each begins one element later.
-    shifted = repeated.reshape(*outer, -1)[..., : count * (size + 1)]
-    windows = shifted.reshape(*outer, count, size + 1)[..., : size + 1 - count]
-    return jnp.moveaxis(windows, (-2, -1), (axis, axis + 1))
-
-
-@ft.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _sums(terms: list[Array], axes: tuple[int, ...]) -> list[Array]:
-    """The sum of each array over the axes, in one loop of one kernel."""
-    zeros = [jnp.zeros((), x.dtype) for x in terms]
-    add = lambda x, y: [*map(jnp.add, x, y)]
-    return jax.lax.reduce(terms, zeros, add, axes)
-
-
-@_sums.defjvp
-def _(axes, primals, tangents):
-    return _sums(*primals, axes), _sums(*tangents, axes)
-
-
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
 @ft.partial(jax.jit, static_argnames=("extent", "count", "reach"))
 def _arriving(
@@ -188,43 +155,44 @@ def _arriving(
     `sheet` is one of `_padded`.
     """
     across, dtype = across_of(reach), sheet.radius.dtype
-    (turns, rows), columns = _turns(reach), 2 * across + 1
+    (turns, rows), columns = in_turns(2 * reach + 1, ROWS), 2 * across + 1
     above, beside = extent.reach - reach, across_of(extent.reach) - across
-    height = sheet.radius.shape[0] - 2 * extent.reach - _turns(extent.reach)[0] + 1
-    width = sheet.radius.shape[1] - 2 * across_of(extent.reach)
+    values, high, wide = sheet.value.shape
+    height = high - 2 * extent.reach - _below(extent)
+    width = wide - 2 * across_of(extent.reach)
     edge = jnp.asarray(np.arange(columns)[None, None, :, None] - across + 0.5, dtype)
 
     def turn(index, sums):
         def near(x):
             start = above + index * rows, beside
             size = height + rows - 1, width + columns - 1
-            return jax.lax.dynamic_slice(x, start, size, allow_negative_indices=False)
+            part = jax.lax.dynamic_slice(x, start, size, allow_negative_indices=False)
+            return windows(part, 0, rows)
 
+        there = lambda x: windows(near(x), 2, columns)
         # From the row that lies above the pixel: its sprites reach down.
         row = (reach - index * rows - jnp.arange(rows)).astype(dtype)
-        own, slant = (_views(near(x), 0, rows) for x in (sheet.radius, sheet.tilt[0]))
-        span = jax.vmap(_half_width)(own, row)
-        moved = slant * span * span / 3
-        ends = jax.lax.optimization_barrier((moved - span, moved + span))
-        start, end = (_views(x, 2, columns) for x in ends)
-        cover = clip01(end + edge) - clip01(start + edge)
-        there = lambda x: _views(_views(near(x), 0, rows), 2, columns)
-        facing, place = 1 + there(sheet.tilt[1]) * row[:, None, None, None], there(sheet.place)
-        light = [*map(there, sheet.value)]
-        terms = []
-        for k in range(count):
-            share = cover * (share_of(place - (first + k).astype(dtype)) * facing)
-            for x, y in zip(light[::2], light[1::2], strict=True):
-                terms.append(jax.lax.complex(share * x, share * y))
-        return sums + jnp.stack(_sums(terms, (0, 2)))
+        span = jax.vmap(_half_width)(near(sheet.radius), row)
+        moved = near(sheet.tilt[0]) * span * span / 3
+        ends, added = (moved - span, moved + span), []
+        for k in range(0, values, AT_ONCE):
+            # Kept in memory; and apart for each kernel, or all would share what covers a tap.
+            ends = jax.lax.optimization_barrier(ends)
+            start, end = (windows(x, 2, columns) for x in ends)
+            cover = clip01(end + edge) - clip01(start + edge)
+            facing = 1 + there(sheet.tilt[1]) * row[:, None, None, None]
+            weights = [cover * (there(share) * facing) for share in shares]
+            light = [*map(there, sheet.value[k : k + AT_ONCE])]
+            terms = [weight * x for weight in weights for x in light]
+            sums_of = jnp.stack(summed(terms, (0, 2)))
+            added.append(sums_of.reshape(count, len(light), height, width))
+        return sums + jnp.concatenate(added, axis=1)
 
     # Made here, or those of all groups would be made at once.
-    sheet, zero = jax.lax.optimization_barrier((sheet, jnp.zeros((), dtype)))
-    pairs = count * len(sheet.value) // 2
-    nothing = jnp.broadcast_to(jax.lax.complex(zero, zero), (pairs, height, width))
-    sums = fori_loop(0, turns, turn, nothing)
-    parts = jnp.stack([sums.real, sums.imag], axis=1)
-    return parts.reshape(count, -1, height, width)
+    shares, zero = share_of(_away(sheet, first, count)), jnp.zeros((), dtype)
+    sheet, shares, zero = jax.lax.optimization_barrier((sheet, shares, zero))
+    nothing = jnp.broadcast_to(zero, (count, values, height, width))
+    return fori_loop(0, turns, turn, nothing)
 
 
 def _away(

@@ -15,18 +15,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxfx._loops import fori_loop
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._taps import Sweep, inside
+from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
-# The most work of one kernel: taps times planes that are read; and that times sums. With more,
-# XLA writes what several sums share to memory, for every tap; chosen by compiling for an H100.
-_READS, _COST = 580, 2300
+# Rows of offsets at a time: more take memory, for the half-widths of all sprites in each.
+_ROWS = 10
 
 
 def _sums(
@@ -42,16 +43,14 @@ def _sums(
     """`Sweep.sums` of `_taps`, by rows of offsets."""
     height, width = radius.shape
     own, other = _listed(own), _listed(other)
-    covers = [radius] * (2 if slopes else 1)
-    shapes = jax.eval_shape(tap, *covers, own, other)
-    sums = jax.tree.map(lambda _: jnp.zeros_like(radius), shapes)
-
+    shapes = jax.eval_shape(tap, *[radius] * (2 if slopes else 1), own, other)
+    planes, tree = jax.tree.flatten(shapes)
     taps = 2 * reach + 1
-    reads, added = (len(jax.tree.leaves(x)) for x in ((covers, own, other), sums))
-    most = max(1, min(_READS // reads, _COST // (reads * added)))
-    run = -(-taps // -(-taps // most))  # taps at a time, of equal runs
-    rows = max(1, min(taps, most // (2 * taps)))  # at a time; more are long to compile
-    turns = -(-taps // rows)
+    turns, rows = in_turns(taps, _ROWS)
+    # Of the pixel in the middle both halves are covered.
+    column = np.abs(np.arange(taps) - reach)[None, None, :, None]
+    factor = jnp.asarray(np.where(column == 0, 2, 1), radius.dtype)
+    shift = jnp.asarray(np.where(column == 0, 0, 0.5 - column), radius.dtype)
 
     def padded(plane, fill=0.0):
         # No sprite reaches the rows that only fill up the last turn.
@@ -60,32 +59,32 @@ def _sums(
 
     there = jax.tree.map(padded, other)
     sprite = radius if by_source else padded(radius, POINT_RADIUS)
-
-    def add_row(index, sums):
-        at_row = ft.partial(
-            jax.lax.dynamic_slice_in_dim,
-            start_index=index,
-            slice_size=height,
-            allow_negative_indices=False,
-        )
-        theirs = jax.tree.map(at_row, there)
-        widths = _half_widths(sprite, jnp.abs(index - reach), slopes)
-        spans = widths if by_source else [*map(at_row, widths)]
-        for k in range(taps):
-            if k and k % run == 0:
-                # Else it would keep what both runs share.
-                sums, spans = jax.lax.optimization_barrier((sums, spans))
-            at = lambda x, k=k: x[:, k : k + width]
-            covers = _covers(k - reach, *(spans if by_source else map(at, spans)))
-            sums = jax.tree.map(jnp.add, sums, tap(*covers, own, jax.tree.map(at, theirs)))
-        return sums
+    at_pixel = jax.tree.map(lambda x: x[None, :, None], own)
 
     def turn(index, sums):
-        for row in range(rows):
-            sums = add_row(index * rows + row, sums)
-        return sums
+        def at_rows(x):
+            part = jax.lax.dynamic_slice_in_dim(
+                x, index * rows, height + rows - 1, allow_negative_indices=False
+            )
+            return windows(part, 0, rows)
 
-    sums = fori_loop(0, turns, turn, sums)
+        row = jnp.abs(index * rows + jnp.arange(rows) - reach)
+        half_widths = jax.vmap(ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0))
+        spans = half_widths(sprite if by_source else at_rows(sprite), row)
+        added = []
+        for k in range(0, len(planes), AT_ONCE):
+            # Else what several kernels share would be kept, for every tap.
+            spans, own, other = jax.lax.optimization_barrier((spans, at_pixel, there))
+            wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
+            passed = factor * wide[0] + shift
+            covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
+            near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), other)
+            terms = jax.tree.leaves(tap(*covers, own, near))[k : k + AT_ONCE]
+            added += summed(terms, (0, 2))
+        return [*map(jnp.add, sums, added)]
+
+    sums = fori_loop(0, turns, turn, [jnp.zeros_like(radius) for _ in planes])
+    sums = jax.tree.unflatten(tree, sums)
     return [jnp.stack(x) if isinstance(x, list) else x for x in sums]
 
 
@@ -103,14 +102,6 @@ def _half_widths(
     lower = segment_integral(radius, jnp.abs(row - 0.5), slopes)
     sign = jnp.sign(row - 0.5)  # half of the middle row lies below its middle
     return [x - sign * y for x, y in zip(upper, lower, strict=True)]
-
-
-def _covers(
-    column: int, width: Float[Array, "height width"], *slope: Float[Array, "height width"]
-) -> list[Float[Array, "height width"]]:
-    """How much of the pixel at `column` is covered and, if it is given, by what slope."""
-    passed, factor = (width + (0.5 - abs(column)), 1) if column else (2 * width, 2)
-    return [_clip(passed), *(inside(passed) * factor * x for x in slope)]
 
 
 def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
