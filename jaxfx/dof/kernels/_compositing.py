@@ -76,7 +76,7 @@ def fill(index: Int[Array, ""], arriving: Stack, state: Filling) -> Filling:
 def lit(
     arriving: Stack, light: Stack, late: Stack
 ) -> tuple[Stack, Stack, Plane, Bool[Array, "height width"]]:
-    """`light` and `late` after one more slice; what it was allowed, and where that was not all."""
+    """`light` and `late` after one more slice; what found room of it, and where not all did."""
     allowed, weight, full = allowance(arriving, light)
     added = allowed[None] * arriving
     return light + added, late + weight[None] * added, allowed, full

@@ -20,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._loops import fori_loop, scan
+from jaxfx._loops import fori_loop
 from jaxfx._numerics import clip01
-from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._compositing import (
     Filling,
@@ -33,6 +32,7 @@ from jaxfx.dof.kernels._compositing import (
     read_slice,
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
+from jaxfx.dof.kernels._taps import inside
 from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
 from jaxfx.dof.sprites import segment_integral
 
@@ -105,11 +105,11 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
         wide = _padded(extent, sheet)
         for start, groups, size, reach in runs:
 
-            def add_group(k, state, run=(start, size, reach), sheet=sheet, wide=wide, n=number):
+            def add_group(k, state, run=(start, size, reach), wide=wide, n=number):
                 start, size, reach = run
                 first = start + k * size
                 arriving = _arriving(extent, wide, first, size, reach)
-                return visit(sheet, n, first, arriving, reach, state)
+                return visit(_cropped(extent, wide), n, first, arriving, reach, state)
 
             # One run after the other, or all of them would take memory at once.
             wide, state = jax.lax.optimization_barrier((wide, state))
@@ -126,23 +126,16 @@ def _padded(extent: Extent, sheet: Sheets) -> Sheets:
     return Sheets(value, jnp.where(radius > 0, radius, 1), pad(sheet.tilt), pad(sheet.place))
 
 
+def _cropped(extent: Extent, wide: Sheets) -> Sheets:
+    """The sheet of `_padded`."""
+    beside = across_of(extent.reach) - extent.reach
+    rows = wide.radius.shape[-2] - _below(extent)
+    return jax.tree.map(lambda x: x[..., :rows, beside : x.shape[-1] - beside], wide)
+
+
 def _below(extent: Extent) -> int:
     """The most rows of offsets that only fill up a turn."""
     return 2 * in_turns(2 * extent.reach + 1, ROWS)[0]
-
-
-def _each_column(add: Callable[..., Any], sums: Array, across: int) -> Array:
-    """`sums` after `add(sums, column)` for all columns from `-across` to `across`.
-
-    As a scan, it is traced once; unrolled where it is lowered, all taps are one kernel.
-    """
-    columns = jnp.arange(-across, across + 1)
-    return scan(add, sums, columns, unroll=2 * across + 1)[0]
-
-
-def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> Array:
-    """`size` columns from `start` on, which lie inside."""
-    return jax.lax.dynamic_slice_in_dim(x, start, size, axis=-1, allow_negative_indices=False)
 
 
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
@@ -164,12 +157,16 @@ def _arriving(
 
     def turn(index, sums):
         def near(x):
-            start = above + index * rows, beside
-            size = height + rows - 1, width + columns - 1
-            part = jax.lax.dynamic_slice(x, start, size, allow_negative_indices=False)
-            return windows(part, 0, rows)
+            part = jax.lax.dynamic_slice_in_dim(
+                x[..., beside : beside + width + columns - 1],
+                above + index * rows,
+                height + rows - 1,
+                axis=-2,
+                allow_negative_indices=False,
+            )
+            return windows(part, -2, rows)
 
-        there = lambda x: windows(near(x), 2, columns)
+        there = lambda x: windows(near(x), -1, columns)
         # From the row that lies above the pixel: its sprites reach down.
         row = (reach - index * rows - jnp.arange(rows)).astype(dtype)
         span = jax.vmap(_half_width)(near(sheet.radius), row)
@@ -178,11 +175,11 @@ def _arriving(
         for k in range(0, values, AT_ONCE):
             # Kept in memory; and apart for each kernel, or all would share what covers a tap.
             ends = jax.lax.optimization_barrier(ends)
-            start, end = (windows(x, 2, columns) for x in ends)
+            start, end = (windows(x, -1, columns) for x in ends)
             cover = clip01(end + edge) - clip01(start + edge)
             facing = 1 + there(sheet.tilt[1]) * row[:, None, None, None]
-            weights = [cover * (there(share) * facing) for share in shares]
-            light = [*map(there, sheet.value[k : k + AT_ONCE])]
+            weights = [cover * (share * facing) for share in there(shares)]
+            light = there(sheet.value[k : k + AT_ONCE])
             terms = [weight * x for weight in weights for x in light]
             sums_of = jnp.stack(summed(terms, (0, 2)))
             added.append(sums_of.reshape(count, len(light), height, width))
@@ -261,63 +258,69 @@ def _read_back(
 ) -> Sheets:
     """The adjoint of `_arriving` at `bar`."""
     far, across = extent.reach, across_of(reach)
-    rows, columns = sheet.radius.shape
+    (turns, rows), taps = in_turns(2 * reach + 1, ROWS), 2 * across + 1
+    high, wide = sheet.radius.shape
     away = _away(sheet, first, len(bar))
-    value, (tilt_x, tilt_y) = sheet.value, sheet.tilt
-    shares, slopes = share_of(away), share_slope_of(away)
-    pad = [(0, 0), (0, 0), (far + reach, far + reach), (far + across, far + across)]
+    value, dtype = sheet.value, sheet.value.dtype
+    sheet, shares, slopes = jax.lax.optimization_barrier(
+        (sheet, share_of(away), share_slope_of(away))
+    )
+    below = far + turns * rows - reach - 1
+    pad = [(0, 0), (0, 0), (far + reach, below), (far + across, far + across)]
     seen = jnp.pad(bar, pad)
-    column_of = jnp.arange(columns)[None] + across
+    edge = jnp.asarray(across + 0.5 - np.arange(taps)[None, None, :, None], dtype)
+    at_pixel = lambda x: x[None, :, None]
 
     def turn(index, sums):
-        row = index - reach
-        planes = jax.lax.dynamic_slice_in_dim(
-            seen, index, rows, axis=-2, allow_negative_indices=False
+        row = (index * rows - reach + jnp.arange(rows)).astype(dtype)
+        widths = jax.vmap(ft.partial(_half_width_and_slope, slope=True), (None, 0))
+        span, slope = widths(sheet.radius, row)
+        moved = sheet.tilt[:1] * span * span / 3
+        near = jax.lax.dynamic_slice_in_dim(
+            seen, index * rows, high + rows - 1, axis=-2, allow_negative_indices=False
         )
-        distance = row.astype(value.dtype)
-        span, slope = _half_width_and_slope(sheet.radius, row, slope=True)
-        by_tilt = span * span / 3
-        start, end = tilt_x * by_tilt - span, tilt_x * by_tilt + span
-        start, end = jax.lax.optimization_barrier((start, end))
+        kept, added = (moved - span, moved + span, slope, near), []
+        row = row[:, None, None, None]
 
-        def add_tap(read, column):
-            edge = 0.5 - column.astype(value.dtype)
-            cover = clip01(end + edge) - clip01(start + edge)
-            there = _columns(planes, start=across + column, size=columns)
-            return read + cover[None, None] * there, None
+        def terms_of(kind, kept, sheet, shares, slopes):
+            start, end, slope = (x[:, :, None] for x in kept[:3])
+            there = windows(windows(kept[3], -2, rows), -1, taps)
+            end_in, start_in = end + edge, start + edge
+            cover = clip01(end_in) - clip01(start_in)
+            tilt_x, facing = at_pixel(sheet.tilt[0]), 1 + at_pixel(sheet.tilt[1]) * row
 
-        read = _each_column(add_tap, jnp.zeros((len(bar), *value.shape), value.dtype), across)
-        read = jax.lax.optimization_barrier(read)
+            def over_slices(weights, k):
+                return sum(at_pixel(w) * x[k] for w, x in zip(weights, there, strict=True))
 
-        def over_slices(weights, read):
-            return jnp.sum(weights[:, None] * read, axis=0)
+            def of_sprite(weights):
+                values = enumerate(sheet.value)
+                return sum(at_pixel(x) * over_slices(weights, k) for k, x in values)
 
-        def at(edge):
-            """The cotangent of the coverage where an end lies: no other one changes with it."""
-            here = column_of + jnp.floor(edge + 0.5).astype(int)
-            # Out of reach are only sprites that have no share in the group.
-            found = jnp.take_along_axis(planes, here[None, None], axis=-1, mode="clip")
-            return sum_planes(value * over_slices(shares, found))
+            if kind == "value":
+                ks = range(len(value))
+                return [facing * cover * over_slices(shares, k) for k in ks]
+            if kind == "tilt_y, place":
+                return [row * cover * of_sprite(shares), facing * cover * of_sprite(slopes)]
+            # Where an end lies: no other pixel changes with it.
+            span, worth = (end - start) / 2, facing * of_sprite(shares)
+            moved = worth * (inside(end_in) - inside(start_in))
+            grown = worth * (inside(end_in) + inside(start_in))
+            of_radius = slope * (grown + moved * tilt_x * span * (2 / 3))
+            return [moved * span * span / 3, of_radius]
 
-        of_value, of_tilt_x, of_radius, of_tilt_y, of_place = sums
-        facing = 1 + tilt_y * distance
-        at_end, at_start = at(end), at(start)
-        moved, grown = facing * (at_end - at_start), facing * (at_end + at_start)
-        arriving = over_slices(shares, read)
-        return (
-            of_value + facing[None] * arriving,
-            of_tilt_x + moved * by_tilt,
-            of_radius + slope * (grown + moved * tilt_x * span * (2 / 3)),
-            of_tilt_y + distance * sum_planes(value * arriving),
-            of_place + facing * sum_planes(value * over_slices(slopes, read)),
-        )
+        groups = [("value", k) for k in range(0, len(value), AT_ONCE)]
+        for kind, k in [*groups, ("tilt_y, place", 0), ("tilt_x, radius", 0)]:
+            # Kept in memory; and apart for each kernel, or all would share what covers a tap.
+            kept, *own = jax.lax.optimization_barrier((kept, sheet, shares, slopes))
+            terms = terms_of(kind, kept, *own)
+            added += summed(terms[k : k + AT_ONCE], (0, 2))
+        return sums + jnp.stack(added)
 
-    zero = jnp.zeros_like(sheet.radius)
-    sums = jnp.zeros_like(value), zero, zero, zero, zero
-    of_value, of_tilt_x, of_radius, of_tilt_y, of_place = fori_loop(
-        0, 2 * reach + 1, turn, sums
-    )
-    found = Sheets(of_value, of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)
+    nothing = jnp.zeros((len(value) + 4, high, wide), dtype)
+    sums = fori_loop(0, turns, turn, nothing)
+    *of_value, of_tilt_y, of_place, of_tilt_x, of_radius = sums
+    tilt = jnp.stack([of_tilt_x, of_tilt_y])
+    found = Sheets(jnp.stack(of_value), of_radius, tilt, of_place)
     # As forward has it: what is not let through passes no derivative.
     return jax.tree.map(lambda x: jnp.where(value[-1] > 0, x, 0), found)
 

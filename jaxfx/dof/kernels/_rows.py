@@ -41,7 +41,7 @@ def _sums(
     slopes: bool,
 ) -> list[Array]:
     """`Sweep.sums` of `_taps`, by rows of offsets."""
-    height, width = radius.shape
+    height = len(radius)
     own, other = _listed(own), _listed(other)
     shapes = jax.eval_shape(tap, *[radius] * (2 if slopes else 1), own, other)
     planes, tree = jax.tree.flatten(shapes)
@@ -69,7 +69,9 @@ def _sums(
             return windows(part, 0, rows)
 
         row = jnp.abs(index * rows + jnp.arange(rows) - reach)
-        half_widths = jax.vmap(ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0))
+        half_widths = jax.vmap(
+            ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0)
+        )
         spans = half_widths(sprite if by_source else at_rows(sprite), row)
         added = []
         for k in range(0, len(planes), AT_ONCE):

@@ -23,10 +23,11 @@ AT_ONCE = 4
 
 
 def windows(x: Shaped[Array, "..."], axis: int, count: int) -> Shaped[Array, "..."]:
-    """`count` shifted views of an axis, each one element further on, along a new axis before it.
+    """`count` shifted views of an axis, along a new axis before it.
 
-    Each is as long as the last, which ends with the axis: element `i` of view `k` is `i + k`.
+    Element `i` of view `k` is element `i + k`; the last view ends with the axis.
     """
+    axis = axis % x.ndim
     x = jnp.moveaxis(x, axis, -1)
     *outer, size = x.shape
     repeated = jnp.broadcast_to(x[..., None, :], (*outer, count + 1, size))
@@ -36,13 +37,16 @@ def windows(x: Shaped[Array, "..."], axis: int, count: int) -> Shaped[Array, "..
     return jnp.moveaxis(views, (-2, -1), (axis, axis + 1))
 
 
-def summed(terms: list[Float[Array, "..."]], axes: tuple[int, ...]) -> list[Float[Array, "..."]]:
+def summed(
+    terms: list[Float[Array, "..."]], axes: tuple[int, ...]
+) -> list[Float[Array, "..."]]:
     """The sum of each of some arrays of one shape over these axes, the first of even length."""
     paired = len(terms) // 2 * 2
     arrays = [*map(jax.lax.complex, terms[:paired:2], terms[1:paired:2]), *terms[paired:]]
     if len(arrays) == 1:
         # The sum of a single array XLA would cut in two, one after the other.
-        sums = [sum(_summed(jnp.split(arrays[0], 2, axes[0]), axes))]
+        first, second = _summed(jnp.split(arrays[0], 2, axes[0]), axes)
+        sums = [first + second]
     else:
         sums = _summed(arrays, axes)
     pairs = sums[: paired // 2]
