@@ -1,10 +1,10 @@
 """The sums of `layered` by rows of offsets, several slices at a time, over the whole image.
 
 For devices on which a launch costs more than what it computes. A group of slices is summed in
-one sweep over the offsets that its sprites reach, then composited slice by slice in one kernel.
-The adjoint sweeps over the same offsets and is owned by the sources: no scatter is left. If the
-threshold is concrete, the number of slices is known when the program is compiled; else the host
-looks at the data.
+one sweep over the offsets that its sprites reach, then composited slice by slice. The taps of
+several rows of offsets are a loop inside one kernel (`_windows`). The adjoint sweeps over the
+same offsets and is owned by the sources: nothing is scattered. If the threshold is concrete,
+the number of slices is known when the program is compiled; else the host looks at the data.
 
 What it does not do well: every tap of a group's largest sprite is computed at every pixel for
 every slice of the group, whatever the image holds.
@@ -37,10 +37,11 @@ from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
 from jaxfx.dof.sprites import segment_integral
 
 
-# Slices per group: 24 planes of sums, of RGB. With 8, XLA keeps the shares of every tap in
-# memory (three times the time at a radius of 32); with fewer, more groups compute coverages.
+# Slices per group: their sums stay in registers. With more, the coverage of a tap is computed
+# for fewer groups, but the sums take more memory.
 GROUP = 3
-# Rows of offsets at a time.
+# The most rows of offsets at a time. More are fewer launches, but where each sprite's span ends
+# is kept for every one of them.
 ROWS = 8
 
 

@@ -1,7 +1,7 @@
 """Scatter as a gather, by rows of offsets, each over the whole image.
 
 For devices on which a launch costs more than what it computes: a turn of the loop adds all taps
-of a row, or of several, in a kernel or two. The turns are as many as the largest sprite has
+of several rows in a kernel or two (`_windows`). The turns are as many as the largest sprite has
 rows, which is known when the program is compiled: the host looks at no result. The adjoint is
 the same sweep, owned by the sources: no scatter is left.
 
@@ -26,7 +26,8 @@ from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
-# Rows of offsets at a time: more take memory, for the half-widths of all sprites in each.
+# The most rows of offsets at a time. More take memory: the half-width of every sprite is kept
+# for each of them.
 _ROWS = 10
 
 
