@@ -33,7 +33,7 @@ from jaxfx.dof.kernels._compositing import (
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
 from jaxfx.dof.kernels._taps import inside
-from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
+from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, together, windows
 from jaxfx.dof.sprites import segment_integral
 
 
@@ -90,10 +90,18 @@ def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
     return runs
 
 
-def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state: Any) -> Any:
+def _each_group(
+    extent: Extent,
+    sheets: Sheets,
+    visit: Callable[..., Any],
+    state: Any,
+    *,
+    apart: bool = False,
+) -> Any:
     """Fold `visit(sheet, number, first, arriving, reach, state)` over groups, from the front.
 
     `first` is the number of the group's first slice, `arriving` are the sums of each of them.
+    With `apart` a kernel sums no more than two planes of one slice.
     """
     for number in range(len(sheets.radius)):
         sheet = jax.tree.map(lambda x, n=number: x[n], sheets)
@@ -109,7 +117,7 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
             def add_group(k, state, run=(start, size, reach), wide=wide, n=number):
                 start, size, reach = run
                 first = start + k * size
-                arriving = _arriving(extent, wide, first, size, reach)
+                arriving = _arriving(extent, wide, first, size, reach, apart)
                 return visit(_cropped(extent, wide), n, first, arriving, reach, state)
 
             # One run after the other, or all of them would take memory at once.
@@ -140,14 +148,20 @@ def _below(extent: Extent) -> int:
 
 
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
-@ft.partial(jax.jit, static_argnames=("extent", "count", "reach"))
+@ft.partial(jax.jit, static_argnames=("extent", "count", "reach", "apart"))
 def _arriving(
-    extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
+    extent: Extent,
+    sheet: Sheets,
+    first: Int[Array, ""],
+    count: int,
+    reach: int,
+    apart: bool,
 ) -> Float[Array, "slice value height width"]:
     """Sums of the sprites of each slice of a group, per pixel of the frame.
 
-    `sheet` is one of `_padded`.
+    `sheet` is one of `_padded`, `apart` as `_each_group` has it.
     """
+    slices, planes = (1, 2) if apart else (count, AT_ONCE)
     across, dtype = across_of(reach), sheet.radius.dtype
     (turns, rows), columns = in_turns(2 * reach + 1, ROWS), 2 * across + 1
     above, beside = extent.reach - reach, across_of(extent.reach) - across
@@ -173,17 +187,21 @@ def _arriving(
         span = jax.vmap(_half_width)(near(sheet.radius), row)
         moved = near(sheet.tilt[0]) * span * span / 3
         ends, added = (moved - span, moved + span), []
-        for k in range(0, values, AT_ONCE):
-            # Kept in memory; and apart for each kernel, or all would share what covers a tap.
-            ends = jax.lax.optimization_barrier(ends)
-            start, end = (windows(x, -1, columns) for x in ends)
-            cover = clip01(end + edge) - clip01(start + edge)
-            facing = 1 + there(sheet.tilt[1]) * row[:, None, None, None]
-            weights = [cover * (share * facing) for share in there(shares)]
-            light = there(sheet.value[k : k + AT_ONCE])
-            terms = [weight * x for weight in weights for x in light]
-            sums_of = jnp.stack(summed(terms, (0, 2)))
-            added.append(sums_of.reshape(count, len(light), height, width))
+        for k in range(0, values, planes):
+            of_slices = []
+            for first_slice in range(0, count, slices):
+                # Kept in memory; apart for each kernel, or all would share what covers a tap.
+                ends = jax.lax.optimization_barrier(ends)
+                start, end = (windows(x, -1, columns) for x in ends)
+                cover = clip01(end + edge) - clip01(start + edge)
+                facing = 1 + there(sheet.tilt[1]) * row[:, None, None, None]
+                some = shares[first_slice : first_slice + slices]
+                weights = [cover * (share * facing) for share in there(some)]
+                light = there(sheet.value[k : k + planes])
+                terms = [weight * x for weight in weights for x in light]
+                of_slices += summed(terms, (0, 2))
+            found = jnp.stack(of_slices)
+            added.append(found.reshape(count, -1, height, width))
         return sums + jnp.concatenate(added, axis=1)
 
     # Made here, or those of all groups would be made at once.
@@ -210,7 +228,9 @@ def _filled(extent: Extent, sheets: Sheets) -> Filling:
     return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
 
 
-def forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
+def forward(
+    extent: Extent, sheets: Sheets, *, apart: bool = False
+) -> Float[Array, "twice_value height width"]:
     """Light and, last, how much of the lens it fills; then the same weighted."""
 
     def add(_sheet, _number, _first, arriving, _reach, state):
@@ -219,14 +239,15 @@ def forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height 
         return state
 
     nothing = nothing_filled(extent, sheets).light
-    return jnp.concatenate(_each_group(extent, sheets, add, (nothing, nothing)))
+    state = nothing, nothing
+    return jnp.concatenate(_each_group(extent, sheets, add, state, apart=apart))
 
 
 def tangent(
     extent: Extent, sheets: Sheets, dot: Sheets
 ) -> Float[Array, "twice_value height width"]:
     """The derivative of `forward` along `dot`: its loops are short enough for JAX's own."""
-    return jax.jvp(ft.partial(forward, extent), (sheets,), (dot,))[1]
+    return jax.jvp(ft.partial(forward, extent, apart=True), (sheets,), (dot,))[1]
 
 
 def adjoint(
@@ -326,4 +347,4 @@ def _read_back(
     return jax.tree.map(lambda x: jnp.where(value[-1] > 0, x, 0), found)
 
 
-SHEET_ROWS = Program(forward, tangent, adjoint)
+SHEET_ROWS = Program(*map(together, (forward, tangent, adjoint)))

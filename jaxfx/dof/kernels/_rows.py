@@ -10,6 +10,7 @@ the image holds.
 """
 
 import functools as ft
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ from jaxfx._loops import fori_loop
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._taps import Sweep, inside
-from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, windows
+from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, together, windows
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
@@ -46,6 +47,8 @@ def _sums(
     own, other = _listed(own), _listed(other)
     shapes = jax.eval_shape(tap, *[radius] * (2 if slopes else 1), own, other)
     planes, tree = jax.tree.flatten(shapes)
+    # Derivatives in the target share with the value what takes long to compute.
+    kernels = _kernels(shapes, 2 if slopes and not by_source else AT_ONCE)
     taps = 2 * reach + 1
     turns, rows = in_turns(taps, _ROWS)
     # Of the pixel in the middle both halves are covered.
@@ -75,20 +78,35 @@ def _sums(
         )
         spans = half_widths(sprite if by_source else at_rows(sprite), row)
         added = []
-        for k in range(0, len(planes), AT_ONCE):
+        for kernel in kernels:
             # Else what several kernels share would be kept, for every tap.
             spans, own, other = jax.lax.optimization_barrier((spans, at_pixel, there))
             wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
             passed = factor * wide[0] + shift
             covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
             near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), other)
-            terms = jax.tree.leaves(tap(*covers, own, near))[k : k + AT_ONCE]
-            added += summed(terms, (0, 2))
+            terms = jax.tree.leaves(tap(*covers, own, near))
+            added += summed([terms[k] for k in kernel], (0, 2))
         return [*map(jnp.add, sums, added)]
 
     sums = fori_loop(0, turns, turn, [jnp.zeros_like(radius) for _ in planes])
     sums = jax.tree.unflatten(tree, sums)
     return [jnp.stack(x) if isinstance(x, list) else x for x in sums]
+
+
+def _kernels(outputs: list[Any], most: int) -> list[list[int]]:
+    """Which planes of the outputs are summed together: of a stack, at most so many.
+
+    A stack's share one weight. Those that stand alone share more than that: only two of them,
+    as one array, are computed without keeping it.
+    """
+    kernels, first = [], 0
+    for stands_alone, alike in itertools.groupby(outputs, lambda x: not isinstance(x, list)):
+        for planes in [[*alike]] if stands_alone else alike:
+            last, step = first + len(planes), 2 if stands_alone else most
+            kernels += [[*range(k, min(k + step, last))] for k in range(first, last, step)]
+            first = last
+    return kernels
 
 
 def _listed(planes: list[Array]) -> list[Any]:
@@ -114,7 +132,7 @@ def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 _SWEEP = Sweep(_sums, _clip)
 ROWS = Program(
-    ft.partial(_taps.forward, _SWEEP),
-    ft.partial(_taps.tangent, _SWEEP),
-    ft.partial(_taps.adjoint, _SWEEP),
+    together(ft.partial(_taps.forward, _SWEEP)),
+    together(ft.partial(_taps.tangent, _SWEEP)),
+    together(ft.partial(_taps.adjoint, _SWEEP)),
 )

@@ -12,9 +12,12 @@ kept in memory before. See `docs/design/xla.md`.
 """
 
 import functools as ft
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Shaped
 
 
@@ -68,3 +71,28 @@ def in_turns(offsets: int, most: int) -> tuple[int, int]:
     """In how many turns offsets are visited, and how many in each: an even number."""
     turns = -(-offsets // most)
     return turns, -(-offsets // (2 * turns)) * 2
+
+
+def together(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function(static, *operands)` for which all arrays have the axis of a batch, or none.
+
+    What is the same for all members of a batch XLA would keep in memory, for every tap.
+    """
+    return lambda static, *operands: function(static, *_together(*operands))
+
+
+@custom_vmap
+def _together(*operands):
+    return operands
+
+
+@_together.def_vmap
+def _(size, is_batched, *operands):
+    leaves, tree = jax.tree.flatten(operands)
+    leaves = [
+        x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
+        for has_axis, x in zip(jax.tree.leaves(is_batched), leaves, strict=True)
+    ]
+    # The barrier keeps XLA from seeing that they are the same.
+    found = jax.tree.unflatten(tree, jax.lax.optimization_barrier(leaves))
+    return found, jax.tree.map(lambda _: True, found)
