@@ -62,16 +62,24 @@ def nothing_filled(extent: Extent, sheets: Sheets) -> Filling:
 
 def fill(index: Int[Array, ""], arriving: Stack, state: Filling) -> Filling:
     """The accumulator after one more slice."""
-    allowed, weight, full = allowance(arriving, state.light)
+    light, late, allowed, full = lit(arriving, state.light, state.late)
     fills = full & (state.last == _NEVER)  # Slices behind that one do not find room either.
-    added = allowed[None] * arriving
     return Filling(
-        state.light + added,
-        state.late + weight[None] * added,
+        light,
+        late,
         jnp.where(fills, index, state.last),
         jnp.where(fills[None], arriving, state.arrived),
         jnp.where(fills, allowed, state.part),
     )
+
+
+def lit(
+    arriving: Stack, light: Stack, late: Stack
+) -> tuple[Stack, Stack, Plane, Bool[Array, "height width"]]:
+    """`light` and `late` after one more slice; what found room of it, and where not all did."""
+    allowed, weight, full = allowance(arriving, light)
+    added = allowed[None] * arriving
+    return light + added, late + weight[None] * added, allowed, full
 
 
 def allowance(

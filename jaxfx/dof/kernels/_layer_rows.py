@@ -1,10 +1,10 @@
 """The sums of `layered` by rows of offsets, several slices at a time, over the whole image.
 
 For devices on which a launch costs more than what it computes. A group of slices is summed in
-one sweep over the offsets that its sprites reach, then composited slice by slice in one kernel.
-The adjoint sweeps over the same offsets and is owned by the sources: no scatter is left. If the
-threshold is concrete, the number of slices is known when the program is compiled; else the host
-looks at the data.
+one sweep over the offsets that its sprites reach, then composited slice by slice. The taps of
+several rows of offsets are a loop inside one kernel (`_windows`). The adjoint sweeps over the
+same offsets and is owned by the sources: nothing is scattered. If the threshold is concrete,
+the number of slices is known when the program is compiled; else the host looks at the data.
 
 What it does not do well: every tap of a group's largest sprite is computed at every pixel for
 every slice of the group, whatever the image holds.
@@ -17,30 +17,36 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Float, Int, Num
 
-from jaxfx._loops import fori_loop, scan
+from jaxfx._loops import fori_loop
 from jaxfx._numerics import clip01
-from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._compositing import (
     Filling,
     begin_reading,
     fill,
+    lit,
     nothing_filled,
     read_slice,
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
+from jaxfx.dof.kernels._taps import inside
+from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, together, windows
 from jaxfx.dof.sprites import segment_integral
 
 
-# Slices per group: 24 planes of sums, of RGB. With 8, XLA keeps the shares of every tap in
-# memory (three times the time at a radius of 32); with fewer, more groups compute coverages.
-GROUP = 6
+# Slices per group: their sums stay in registers. With more, the coverage of a tap is computed
+# for fewer groups, but the sums take more memory.
+GROUP = 3
+# The most rows of offsets at a time. More are fewer launches, but where each sprite's span ends
+# is kept for every one of them.
+ROWS = 8
 
 
 @ft.partial(jax.custom_jvp)
-def _half_width(radius: Float[Array, "*size"], row: Int[Array, ""]) -> Float[Array, "*size"]:
+def _half_width(radius: Float[Array, "*size"], row: Num[Array, ""]) -> Float[Array, "*size"]:
     """Mean half-width of each disc in a row of pixels, `row` rows from its centre."""
     return _half_width_and_slope(radius, row, slope=False)[0]
 
@@ -84,12 +90,19 @@ def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
     return runs
 
 
-def _add_group(visit, first, size, reach, k, state):
-    return visit(first + k * size, size, reach, state)
+def _each_group(
+    extent: Extent,
+    sheets: Sheets,
+    visit: Callable[..., Any],
+    state: Any,
+    *,
+    apart: bool = False,
+) -> Any:
+    """Fold `visit(sheet, number, first, arriving, reach, state)` over groups, from the front.
 
-
-def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state: Any) -> Any:
-    """Fold `visit(sheet, number, first, count, reach, state)` over groups, from the front."""
+    `first` is the number of the group's first slice, `arriving` are the sums of each of them.
+    With `apart` a kernel sums no more than two planes of one slice.
+    """
     for number in range(len(sheets.radius)):
         sheet = jax.tree.map(lambda x, n=number: x[n], sheets)
         if extent.slices is None:
@@ -98,70 +111,104 @@ def _each_group(extent: Extent, sheets: Sheets, visit: Callable[..., Any], state
             runs = [(first, -(-slices // GROUP), GROUP, extent.reach)]
         else:
             runs = _groups(extent, extent.slices)
-        for first, groups, size, reach in runs:
+        wide = _padded(extent, sheet)
+        for start, groups, size, reach in runs:
+
+            def add_group(k, state, run=(start, size, reach), wide=wide, n=number):
+                start, size, reach = run
+                first = start + k * size
+                arriving = _arriving(extent, wide, first, size, reach, apart)
+                return visit(_cropped(extent, wide), n, first, arriving, reach, state)
+
             # One run after the other, or all of them would take memory at once.
-            sheet, state = jax.lax.optimization_barrier((sheet, state))
-            add = ft.partial(_add_group, ft.partial(visit, sheet, number), first, size, reach)
-            state = fori_loop(0, groups, add, state)
+            wide, state = jax.lax.optimization_barrier((wide, state))
+            state = fori_loop(0, groups, add_group, state)
     return state
 
 
-def _each_column(add: Callable[..., Any], sums: Array, across: int) -> Array:
-    """`sums` after `add(sums, column)` for all columns from `-across` to `across`.
+def _padded(extent: Extent, sheet: Sheets) -> Sheets:
+    """A sheet as wide as any offset goes, and as high as the last turn."""
+    beside = across_of(extent.reach) - extent.reach
+    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, _below(extent)), (beside,) * 2])
+    radius = pad(sheet.radius)
+    value = pad(jnp.where(sheet.value[-1:] > 0, sheet.value, 0))
+    return Sheets(value, jnp.where(radius > 0, radius, 1), pad(sheet.tilt), pad(sheet.place))
 
-    As a scan, it is traced once; unrolled where it is lowered, all taps are one kernel.
-    """
-    columns = jnp.arange(-across, across + 1)
-    return scan(add, sums, columns, unroll=2 * across + 1)[0]
+
+def _cropped(extent: Extent, wide: Sheets) -> Sheets:
+    """The sheet of `_padded`."""
+    beside = across_of(extent.reach) - extent.reach
+    rows = wide.radius.shape[-2] - _below(extent)
+    return jax.tree.map(lambda x: x[..., :rows, beside : x.shape[-1] - beside], wide)
 
 
-def _columns(x: Float[Array, "... width"], start: Int[Array, ""], size: int) -> Array:
-    """`size` columns from `start` on, which lie inside."""
-    return jax.lax.dynamic_slice_in_dim(x, start, size, axis=-1, allow_negative_indices=False)
+def _below(extent: Extent) -> int:
+    """The most rows of offsets that only fill up a turn."""
+    return 2 * in_turns(2 * extent.reach + 1, ROWS)[0]
 
 
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
-@ft.partial(jax.jit, static_argnames=("extent", "count", "reach"))
+@ft.partial(jax.jit, static_argnames=("extent", "count", "reach", "apart"))
 def _arriving(
-    extent: Extent, sheet: Sheets, first: Int[Array, ""], count: int, reach: int
+    extent: Extent,
+    sheet: Sheets,
+    first: Int[Array, ""],
+    count: int,
+    reach: int,
+    apart: bool,
 ) -> Float[Array, "slice value height width"]:
-    """Sums of the sprites of each slice of a group, per pixel of the frame."""
-    far, across = extent.reach, across_of(reach)
-    height, width = (n - 2 * far for n in sheet.radius.shape)
-    wider = max(0, across - far)
-    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(wider, wider)])
-    value = pad(jnp.where(sheet.value[-1:] > 0, sheet.value, 0))
-    radius, tilt_x, tilt_y, place = (pad(x) for x in (sheet.radius, *sheet.tilt, sheet.place))
-    slices = (first + jnp.arange(count)).astype(place.dtype)[:, None, None]
+    """Sums of the sprites of each slice of a group, per pixel of the frame.
+
+    `sheet` is one of `_padded`, `apart` as `_each_group` has it.
+    """
+    slices, planes = (1, 2) if apart else (count, AT_ONCE)
+    across, dtype = across_of(reach), sheet.radius.dtype
+    (turns, rows), columns = in_turns(2 * reach + 1, ROWS), 2 * across + 1
+    above, beside = extent.reach - reach, across_of(extent.reach) - across
+    values, high, wide = sheet.value.shape
+    height = high - 2 * extent.reach - _below(extent)
+    width = wide - 2 * across_of(extent.reach)
+    edge = jnp.asarray(np.arange(columns)[None, None, :, None] - across + 0.5, dtype)
 
     def turn(index, sums):
-        row = index - reach
-        at_row = ft.partial(
-            jax.lax.dynamic_slice_in_dim,
-            start_index=far - row,
-            slice_size=height,
-            axis=-2,
-            allow_negative_indices=False,
-        )
-        own, slant, turned, places, light = map(at_row, (radius, tilt_x, tilt_y, place, value))
-        span = _half_width(jnp.where(own > 0, own, 1), row)
-        moved = slant * span * span / 3
-        start, end, facing = moved - span, moved + span, 1 + turned * row.astype(own.dtype)
-        start, end, facing = jax.lax.optimization_barrier((start, end, facing))
+        def near(x):
+            part = jax.lax.dynamic_slice_in_dim(
+                x[..., beside : beside + width + columns - 1],
+                above + index * rows,
+                height + rows - 1,
+                axis=-2,
+                allow_negative_indices=False,
+            )
+            return windows(part, -2, rows)
 
-        def add_tap(sums, column):
-            there = ft.partial(_columns, start=far + wider - column, size=width)
-            edge = 0.5 - column.astype(own.dtype)
-            cover = (clip01(there(end) + edge) - clip01(there(start) + edge)) * there(facing)
-            shares = cover[None] * share_of(there(places)[None] - slices)
-            return sums + shares[:, None] * there(light)[None], None
-
-        return _each_column(add_tap, sums, across)
+        there = lambda x: windows(near(x), -1, columns)
+        # From the row that lies above the pixel: its sprites reach down.
+        row = (reach - index * rows - jnp.arange(rows)).astype(dtype)
+        span = jax.vmap(_half_width)(near(sheet.radius), row)
+        moved = near(sheet.tilt[0]) * span * span / 3
+        ends, added = (moved - span, moved + span), []
+        for k in range(0, values, planes):
+            of_slices = []
+            for first_slice in range(0, count, slices):
+                # Kept in memory; apart for each kernel, or all would share what covers a tap.
+                ends = jax.lax.optimization_barrier(ends)
+                start, end = (windows(x, -1, columns) for x in ends)
+                cover = clip01(end + edge) - clip01(start + edge)
+                facing = 1 + there(sheet.tilt[1]) * row[:, None, None, None]
+                some = shares[first_slice : first_slice + slices]
+                weights = [cover * (share * facing) for share in there(some)]
+                light = there(sheet.value[k : k + planes])
+                terms = [weight * x for weight in weights for x in light]
+                of_slices += summed(terms, (0, 2))
+            found = jnp.stack(of_slices)
+            added.append(found.reshape(count, -1, height, width))
+        return sums + jnp.concatenate(added, axis=1)
 
     # Made here, or those of all groups would be made at once.
-    value, zero = jax.lax.optimization_barrier((value, jnp.zeros((), value.dtype)))
-    nothing = jnp.broadcast_to(zero, (count, len(value), height, width))
-    return fori_loop(0, 2 * reach + 1, turn, nothing)
+    shares, zero = share_of(_away(sheet, first, count)), jnp.zeros((), dtype)
+    sheet, shares, zero = jax.lax.optimization_barrier((sheet, shares, zero))
+    nothing = jnp.broadcast_to(zero, (count, values, height, width))
+    return fori_loop(0, turns, turn, nothing)
 
 
 def _away(
@@ -173,26 +220,34 @@ def _away(
 
 
 def _filled(extent: Extent, sheets: Sheets) -> Filling:
-    def add(sheet, number, first, count, reach, state):
-        indices = number * APART + first + jnp.arange(count)
-        arriving = _arriving(extent, sheet, first, count, reach)
-        add_slice = lambda state, each: (fill(each[0], each[1], state), None)
-        return scan(add_slice, state, (indices, arriving), unroll=count)[0]
+    def add(_sheet, number, first, arriving, _reach, state):
+        for k, each in enumerate(arriving):
+            state = fill(number * APART + first + k, each, state)
+        return state
 
     return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
 
 
-def forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
+def forward(
+    extent: Extent, sheets: Sheets, *, apart: bool = False
+) -> Float[Array, "twice_value height width"]:
     """Light and, last, how much of the lens it fills; then the same weighted."""
-    filling = _filled(extent, sheets)
-    return jnp.concatenate([filling.light, filling.late])
+
+    def add(_sheet, _number, _first, arriving, _reach, state):
+        for each in arriving:
+            state = lit(each, *state)[:2]
+        return state
+
+    nothing = nothing_filled(extent, sheets).light
+    state = nothing, nothing
+    return jnp.concatenate(_each_group(extent, sheets, add, state, apart=apart))
 
 
 def tangent(
     extent: Extent, sheets: Sheets, dot: Sheets
 ) -> Float[Array, "twice_value height width"]:
     """The derivative of `forward` along `dot`: its loops are short enough for JAX's own."""
-    return jax.jvp(ft.partial(forward, extent), (sheets,), (dot,))[1]
+    return jax.jvp(ft.partial(forward, extent, apart=True), (sheets,), (dot,))[1]
 
 
 def adjoint(
@@ -201,17 +256,13 @@ def adjoint(
     """The transpose of `tangent`."""
     reading = begin_reading(_filled(extent, sheets), bar)
 
-    def read(sheet, number, first, count, reach, state):
+    def read(sheet, number, first, arriving, reach, state):
         bars, carry = state
-        indices = number * APART + first + jnp.arange(count)
-        arriving = _arriving(extent, sheet, first, count, reach)
-
-        def read_next(carry, each):
-            seen, carry = read_slice(reading, each[0], each[1], carry)
-            return carry, seen
-
-        carry, bar = scan(read_next, carry, (indices, arriving), unroll=count)
-        found = _read_back(extent, sheet, first, reach, bar)
+        seen = []
+        for k, each in enumerate(arriving):
+            bar, carry = read_slice(reading, number * APART + first + k, each, carry)
+            seen.append(bar)
+        found = _read_back(extent, sheet, first, reach, jnp.stack(seen))
         bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
         return bars, carry
 
@@ -229,65 +280,71 @@ def _read_back(
 ) -> Sheets:
     """The adjoint of `_arriving` at `bar`."""
     far, across = extent.reach, across_of(reach)
-    rows, columns = sheet.radius.shape
+    (turns, rows), taps = in_turns(2 * reach + 1, ROWS), 2 * across + 1
+    high, wide = sheet.radius.shape
     away = _away(sheet, first, len(bar))
-    value, (tilt_x, tilt_y) = sheet.value, sheet.tilt
-    shares, slopes = share_of(away), share_slope_of(away)
-    pad = [(0, 0), (0, 0), (far + reach, far + reach), (far + across, far + across)]
+    value, dtype = sheet.value, sheet.value.dtype
+    sheet, shares, slopes = jax.lax.optimization_barrier(
+        (sheet, share_of(away), share_slope_of(away))
+    )
+    below = far + turns * rows - reach - 1
+    pad = [(0, 0), (0, 0), (far + reach, below), (far + across, far + across)]
     seen = jnp.pad(bar, pad)
-    column_of = jnp.arange(columns)[None] + across
+    edge = jnp.asarray(across + 0.5 - np.arange(taps)[None, None, :, None], dtype)
+    at_pixel = lambda x: x[None, :, None]
 
     def turn(index, sums):
-        row = index - reach
-        planes = jax.lax.dynamic_slice_in_dim(
-            seen, index, rows, axis=-2, allow_negative_indices=False
+        row = (index * rows - reach + jnp.arange(rows)).astype(dtype)
+        widths = jax.vmap(ft.partial(_half_width_and_slope, slope=True), (None, 0))
+        span, slope = widths(sheet.radius, row)
+        moved = sheet.tilt[:1] * span * span / 3
+        near = jax.lax.dynamic_slice_in_dim(
+            seen, index * rows, high + rows - 1, axis=-2, allow_negative_indices=False
         )
-        distance = row.astype(value.dtype)
-        span, slope = _half_width_and_slope(sheet.radius, row, slope=True)
-        by_tilt = span * span / 3
-        start, end = tilt_x * by_tilt - span, tilt_x * by_tilt + span
-        start, end = jax.lax.optimization_barrier((start, end))
+        kept, added = (moved - span, moved + span, slope, near), []
+        row = row[:, None, None, None]
 
-        def add_tap(read, column):
-            edge = 0.5 - column.astype(value.dtype)
-            cover = clip01(end + edge) - clip01(start + edge)
-            there = _columns(planes, start=across + column, size=columns)
-            return read + cover[None, None] * there, None
+        def terms_of(kind, kept, sheet, shares, slopes):
+            start, end, slope = (x[:, :, None] for x in kept[:3])
+            there = windows(windows(kept[3], -2, rows), -1, taps)
+            end_in, start_in = end + edge, start + edge
+            cover = clip01(end_in) - clip01(start_in)
+            tilt_x, facing = at_pixel(sheet.tilt[0]), 1 + at_pixel(sheet.tilt[1]) * row
 
-        read = _each_column(add_tap, jnp.zeros((len(bar), *value.shape), value.dtype), across)
-        read = jax.lax.optimization_barrier(read)
+            def over_slices(weights, k):
+                return sum(at_pixel(w) * x[k] for w, x in zip(weights, there, strict=True))
 
-        def over_slices(weights, read):
-            return jnp.sum(weights[:, None] * read, axis=0)
+            def of_sprite(weights):
+                values = enumerate(sheet.value)
+                return sum(at_pixel(x) * over_slices(weights, k) for k, x in values)
 
-        def at(edge):
-            """The cotangent of the coverage where an end lies: no other one changes with it."""
-            here = column_of + jnp.floor(edge + 0.5).astype(int)
-            # Out of reach are only sprites that have no share in the group.
-            found = jnp.take_along_axis(planes, here[None, None], axis=-1, mode="clip")
-            return sum_planes(value * over_slices(shares, found))
+            if kind == "value":
+                ks = range(len(value))
+                return [facing * cover * over_slices(shares, k) for k in ks]
+            if kind == "tilt_y, place":
+                return [row * cover * of_sprite(shares), facing * cover * of_sprite(slopes)]
+            # Where an end lies: no other pixel changes with it.
+            span, worth = (end - start) / 2, facing * of_sprite(shares)
+            moved = worth * (inside(end_in) - inside(start_in))
+            grown = worth * (inside(end_in) + inside(start_in))
+            of_radius = slope * (grown + moved * tilt_x * span * (2 / 3))
+            return [moved * span * span / 3, of_radius]
 
-        of_value, of_tilt_x, of_radius, of_tilt_y, of_place = sums
-        facing = 1 + tilt_y * distance
-        at_end, at_start = at(end), at(start)
-        moved, grown = facing * (at_end - at_start), facing * (at_end + at_start)
-        arriving = over_slices(shares, read)
-        return (
-            of_value + facing[None] * arriving,
-            of_tilt_x + moved * by_tilt,
-            of_radius + slope * (grown + moved * tilt_x * span * (2 / 3)),
-            of_tilt_y + distance * sum_planes(value * arriving),
-            of_place + facing * sum_planes(value * over_slices(slopes, read)),
-        )
+        groups = [("value", k) for k in range(0, len(value), AT_ONCE)]
+        for kind, k in [*groups, ("tilt_y, place", 0), ("tilt_x, radius", 0)]:
+            # Kept in memory; and apart for each kernel, or all would share what covers a tap.
+            kept, *own = jax.lax.optimization_barrier((kept, sheet, shares, slopes))
+            terms = terms_of(kind, kept, *own)
+            added += summed(terms[k : k + AT_ONCE], (0, 2))
+        return sums + jnp.stack(added)
 
-    zero = jnp.zeros_like(sheet.radius)
-    sums = jnp.zeros_like(value), zero, zero, zero, zero
-    of_value, of_tilt_x, of_radius, of_tilt_y, of_place = fori_loop(
-        0, 2 * reach + 1, turn, sums
-    )
-    found = Sheets(of_value, of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)
+    nothing = jnp.zeros((len(value) + 4, high, wide), dtype)
+    sums = fori_loop(0, turns, turn, nothing)
+    *of_value, of_tilt_y, of_place, of_tilt_x, of_radius = sums
+    tilt = jnp.stack([of_tilt_x, of_tilt_y])
+    found = Sheets(jnp.stack(of_value), of_radius, tilt, of_place)
     # As forward has it: what is not let through passes no derivative.
     return jax.tree.map(lambda x: jnp.where(value[-1] > 0, x, 0), found)
 
 
-SHEET_ROWS = Program(forward, tangent, adjoint)
+SHEET_ROWS = Program(*map(together, (forward, tangent, adjoint)))

@@ -1,7 +1,7 @@
 """Scatter as a gather, by rows of offsets, each over the whole image.
 
 For devices on which a launch costs more than what it computes: a turn of the loop adds all taps
-of a row, or of several, in a kernel or two. The turns are as many as the largest sprite has
+of several rows in a kernel or two (`_windows`). The turns are as many as the largest sprite has
 rows, which is known when the program is compiled: the host looks at no result. The adjoint is
 the same sweep, owned by the sources: no scatter is left.
 
@@ -10,23 +10,26 @@ the image holds.
 """
 
 import functools as ft
+import itertools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxfx._loops import fori_loop
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._taps import Sweep, inside
+from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, together, windows
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
-# The most work of one kernel: taps times planes that are read; and that times sums. With more,
-# XLA writes what several sums share to memory, for every tap; chosen by compiling for an H100.
-_READS, _COST = 580, 2300
+# The most rows of offsets at a time. More take memory: the half-width of every sprite is kept
+# for each of them.
+_ROWS = 10
 
 
 def _sums(
@@ -40,18 +43,18 @@ def _sums(
     slopes: bool,
 ) -> list[Array]:
     """`Sweep.sums` of `_taps`, by rows of offsets."""
-    height, width = radius.shape
+    height = len(radius)
     own, other = _listed(own), _listed(other)
-    covers = [radius] * (2 if slopes else 1)
-    shapes = jax.eval_shape(tap, *covers, own, other)
-    sums = jax.tree.map(lambda _: jnp.zeros_like(radius), shapes)
-
+    shapes = jax.eval_shape(tap, *[radius] * (2 if slopes else 1), own, other)
+    planes, tree = jax.tree.flatten(shapes)
+    # Derivatives in the target share with the value what takes long to compute.
+    kernels = _kernels(shapes, 2 if slopes and not by_source else AT_ONCE)
     taps = 2 * reach + 1
-    reads, added = (len(jax.tree.leaves(x)) for x in ((covers, own, other), sums))
-    most = max(1, min(_READS // reads, _COST // (reads * added)))
-    run = -(-taps // -(-taps // most))  # taps at a time, of equal runs
-    rows = max(1, min(taps, most // (2 * taps)))  # at a time; more are long to compile
-    turns = -(-taps // rows)
+    turns, rows = in_turns(taps, _ROWS)
+    # Of the pixel in the middle both halves are covered.
+    column = np.abs(np.arange(taps) - reach)[None, None, :, None]
+    factor = jnp.asarray(np.where(column == 0, 2, 1), radius.dtype)
+    shift = jnp.asarray(np.where(column == 0, 0, 0.5 - column), radius.dtype)
 
     def padded(plane, fill=0.0):
         # No sprite reaches the rows that only fill up the last turn.
@@ -60,33 +63,50 @@ def _sums(
 
     there = jax.tree.map(padded, other)
     sprite = radius if by_source else padded(radius, POINT_RADIUS)
-
-    def add_row(index, sums):
-        at_row = ft.partial(
-            jax.lax.dynamic_slice_in_dim,
-            start_index=index,
-            slice_size=height,
-            allow_negative_indices=False,
-        )
-        theirs = jax.tree.map(at_row, there)
-        widths = _half_widths(sprite, jnp.abs(index - reach), slopes)
-        spans = widths if by_source else [*map(at_row, widths)]
-        for k in range(taps):
-            if k and k % run == 0:
-                # Else it would keep what both runs share.
-                sums, spans = jax.lax.optimization_barrier((sums, spans))
-            at = lambda x, k=k: x[:, k : k + width]
-            covers = _covers(k - reach, *(spans if by_source else map(at, spans)))
-            sums = jax.tree.map(jnp.add, sums, tap(*covers, own, jax.tree.map(at, theirs)))
-        return sums
+    at_pixel = jax.tree.map(lambda x: x[None, :, None], own)
 
     def turn(index, sums):
-        for row in range(rows):
-            sums = add_row(index * rows + row, sums)
-        return sums
+        def at_rows(x):
+            part = jax.lax.dynamic_slice_in_dim(
+                x, index * rows, height + rows - 1, allow_negative_indices=False
+            )
+            return windows(part, 0, rows)
 
-    sums = fori_loop(0, turns, turn, sums)
+        row = jnp.abs(index * rows + jnp.arange(rows) - reach)
+        half_widths = jax.vmap(
+            ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0)
+        )
+        spans = half_widths(sprite if by_source else at_rows(sprite), row)
+        added = []
+        for kernel in kernels:
+            # Else what several kernels share would be kept, for every tap.
+            spans, own, other = jax.lax.optimization_barrier((spans, at_pixel, there))
+            wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
+            passed = factor * wide[0] + shift
+            covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
+            near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), other)
+            terms = jax.tree.leaves(tap(*covers, own, near))
+            added += summed([terms[k] for k in kernel], (0, 2))
+        return [*map(jnp.add, sums, added)]
+
+    sums = fori_loop(0, turns, turn, [jnp.zeros_like(radius) for _ in planes])
+    sums = jax.tree.unflatten(tree, sums)
     return [jnp.stack(x) if isinstance(x, list) else x for x in sums]
+
+
+def _kernels(outputs: list[Any], most: int) -> list[list[int]]:
+    """Which planes of the outputs are summed together: of a stack, at most so many.
+
+    A stack's share one weight. Those that stand alone share more than that: only two of them,
+    as one array, are computed without keeping it.
+    """
+    kernels, first = [], 0
+    for stands_alone, alike in itertools.groupby(outputs, lambda x: not isinstance(x, list)):
+        for planes in [[*alike]] if stands_alone else alike:
+            last, step = first + len(planes), 2 if stands_alone else most
+            kernels += [[*range(k, min(k + step, last))] for k in range(first, last, step)]
+            first = last
+    return kernels
 
 
 def _listed(planes: list[Array]) -> list[Any]:
@@ -105,14 +125,6 @@ def _half_widths(
     return [x - sign * y for x, y in zip(upper, lower, strict=True)]
 
 
-def _covers(
-    column: int, width: Float[Array, "height width"], *slope: Float[Array, "height width"]
-) -> list[Float[Array, "height width"]]:
-    """How much of the pixel at `column` is covered and, if it is given, by what slope."""
-    passed, factor = (width + (0.5 - abs(column)), 1) if column else (2 * width, 2)
-    return [_clip(passed), *(inside(passed) * factor * x for x in slope)]
-
-
 def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Clamp to [0, 1], in one operation: XLA for a GPU takes its time for each of them."""
     return jax.lax.clamp(jnp.zeros((), x.dtype), x, jnp.ones((), x.dtype))
@@ -120,7 +132,7 @@ def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 _SWEEP = Sweep(_sums, _clip)
 ROWS = Program(
-    ft.partial(_taps.forward, _SWEEP),
-    ft.partial(_taps.tangent, _SWEEP),
-    ft.partial(_taps.adjoint, _SWEEP),
+    together(ft.partial(_taps.forward, _SWEEP)),
+    together(ft.partial(_taps.tangent, _SWEEP)),
+    together(ft.partial(_taps.adjoint, _SWEEP)),
 )

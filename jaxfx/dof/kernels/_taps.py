@@ -58,8 +58,8 @@ def stacked(value: Float[Array, "height width value"]) -> Float[Array, "value he
     return jnp.moveaxis(value, -1, 0)
 
 
-def scaled(weight: Float[Array, "height width"], stack: Stack) -> Stack:
-    """Each plane of a stack times the weight."""
+def scaled(weight: Float[Array, "*size"], stack: Stack) -> Stack:
+    """Each plane of a stack, or array of a list, times the weight."""
     if isinstance(stack, list):
         return [weight * plane for plane in stack]
     return weight[None] * stack
