@@ -76,8 +76,8 @@ def test_every_function_and_its_gradient_are_computed_where_a_batch_lies(
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("mesh", MESHES)
 @pytest.mark.parametrize("name", ["dof.scatter", "reproject.warp"])
+@pytest.mark.parametrize("mesh", MESHES)
 def test_a_batch_lies_along_one_axis_of_two(eight_devices, name, mesh):
     """On the other axis its devices hold the same, and are known to."""
     grid = {"shape": (4, 2), "names": ("batch", "other")}
