@@ -9,9 +9,6 @@ from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt
 from tests.helpers.forms import first
 
 
-OPTIONS = {"rtol": 1e-4, "atol": 1e-5}
-
-
 def valley(y):
     """Rosenbrock's function: steps are rejected, and damped."""
     return jnp.stack([10 * (y["b"] - y["a"] ** 2), 1 - y["a"]])
@@ -49,8 +46,10 @@ def path(solver, function, steps):
 
 @first(("function", "steps"), [(valley, 40), (decay, 20), (underdetermined, 20), (broken, 2)])
 def test_every_step_is_that_of_optimistix(function, steps):
-    solvers = LevenbergMarquardt(**OPTIONS), optx.LevenbergMarquardt(**OPTIONS)
-    found, expected = (list(path(solver, function, steps)) for solver in solvers)
+    ours, theirs = (
+        make(rtol=1e-4, atol=1e-5) for make in (LevenbergMarquardt, optx.LevenbergMarquardt)
+    )
+    found, expected = list(path(ours, function, steps)), list(path(theirs, function, steps))
     assert len(found) == len(expected)
     for (*numbers, done, result), (*others, has_ended, verdict) in zip(
         found, expected, strict=True
