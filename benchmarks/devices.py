@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from benchmarks.native import cuda
@@ -37,7 +36,7 @@ from jaxfx.dof.arguments import pixels
 from jaxfx.dof.kernels import TILES, to_planes
 from jaxfx.dof.scatter import to_sprites
 from jaxfx.dof.sprites import reach
-from jaxfx.fit._descent import _begin, _Objective, _step
+from jaxfx.fit._descent import _begin, _default_solver, _Objective, _step
 
 
 # Bytes and float32 operations per second, by the beginning of a card's name.
@@ -172,7 +171,7 @@ def fitting(side):
     """One Levenberg-Marquardt step of `fit.dof` in all of its four parameters."""
     image, depth, lens = _discs(side, 8)
     reference = dof.scatter(image, depth, lens, gamma=2.0, max_coc=16.0)
-    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+    solver = _default_solver()
     start = {"aperture": 0.9, "focus_distance": 2.1, "gamma": 1.5, "epsilon": 1.5}
 
     def step(misfit, unknowns):

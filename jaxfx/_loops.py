@@ -86,6 +86,17 @@ def alike(
     return marked, _varying(operands, axes)
 
 
+def varying_as(data: Any, tree: Any) -> Any:
+    """The values of `tree`, marked as varying over all axes over which an array of `data` does.
+
+    A tangent must vary as what it is the tangent of; a carry that begins so is traced once.
+    """
+    if not _manual_axes():
+        return tree
+    arrays = [leaf for leaf in jax.tree.leaves(data) if isinstance(leaf, jax.Array)]
+    return _varying(tree, _axes(arrays))
+
+
 def _manual_axes() -> tuple[str, ...]:
     """The axes of the mesh over which an enclosing `shard_map` maps."""
     return jax.sharding.get_abstract_mesh().manual_axes
@@ -105,10 +116,11 @@ def _axes(*trees: Any) -> frozenset[str]:
 def _axes_after(step: Callable[..., Any], *data: Any) -> frozenset[str]:
     """The axes over which a carry varies after `step` of it and other data, or any of these.
 
-    Once is enough: what the step closes over is then in too.
+    Once is enough: what the step closes over is then in too. Where nothing is carried, or all
+    varies already, the step need not be traced to see it.
     """
     before = _axes(data)
-    if before == frozenset(_manual_axes()):
+    if not jax.tree.leaves(data[0]) or before == frozenset(_manual_axes()):
         return before
     return before | _axes(jax.eval_shape(step, *data))
 

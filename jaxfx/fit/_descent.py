@@ -16,8 +16,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxfx._checks import is_concrete
-from jaxfx._loops import while_loop
+from jaxfx._loops import cond, varying_as, while_loop
 from jaxfx._progress import Bar
+from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt
 
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -169,12 +170,13 @@ def _descend_in_program(
         jnp.zeros((), bool),
         arrays(going),
     )
+    first = varying_as((fn, unknowns), first)
     at = while_loop(lambda at: ~at.has_ended & (at.count < max_steps), step, first)
     y = _finish(solver, fn, at.y, at.solver, at.losses[at.count - 1], at.reason)
     loss = _loss(fn, y)
     diverged = ~jnp.isfinite(loss)
     y = jax.tree.map(functools.partial(jnp.where, diverged), at.best, y)
-    loss = jax.lax.cond(diverged, lambda: _loss(fn, at.best), lambda: loss)
+    loss = cond(diverged, lambda: _loss(fn, at.best), lambda: loss)
     reason = optx.RESULTS.where(diverged, optx.RESULTS.nonlinear_divergence, at.reason)
     return End(y, [at.losses, loss], verdict(reason))
 
@@ -195,8 +197,8 @@ class _Objective(eqx.Module):
 
 
 @functools.cache
-def _default_solver() -> optx.LevenbergMarquardt:
-    return optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+def _default_solver() -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=1e-4, atol=1e-5)
 
 
 # A solver's state holds functions, which `jit` compares by identity: a state passed to `jit` as

@@ -27,7 +27,12 @@ def joined(losses: list[Float[Array, "..."]]) -> Float[Array, " steps"]:
 
 
 def fitted_under_transform(
-    fit: Callable[[Any], Any], data: Any, function: str, throw: bool, progress: bool
+    fit: Callable[[Any], Any],
+    data: Any,
+    function: str,
+    throw: bool,
+    progress: bool,
+    solver: Any,
 ) -> Any:
     """`fit(data)` where `data`, a pytree, is traced: of a batch, each device fits its own.
 
@@ -39,10 +44,11 @@ def fitted_under_transform(
                 f"`{function}({name}=...)` must be False under `jit` and `vmap`, where a "
                 f"search can neither raise nor print, got {value!r}."
             )
-    if jax.sharding.get_abstract_mesh().manual_axes:  # The loops of a solver are not ours.
+    if solver is not None and jax.sharding.get_abstract_mesh().manual_axes:
         raise ValueError(
-            f"`{function}` can't search inside `jax.shard_map`, of which its solver knows "
-            "nothing: `jit(vmap(...))` of a sharded batch searches where each member lies."
+            f"`{function}(solver=...)` must be None inside `jax.shard_map`, of which "
+            "optimistix knows nothing: `jit(vmap(...))` of a sharded batch takes any solver, "
+            f"got {solver!r}."
         )
     arrays, static = eqx.partition(data, eqx.is_array)
     of_arrays = one_by_one_on_cpu(lambda arrays: fit(eqx.combine(arrays, static)))

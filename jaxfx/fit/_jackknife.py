@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfx._platform import one_by_one_on_cpu
+
 
 # Tiles on a side of an image: 64 blocks. Of fewer the variance is estimated poorly; more are
 # so small that residuals depend on those of the next tile.
@@ -45,7 +47,9 @@ def covariance(
     slope = sums(scaled * residual[:, None])
     floor = jnp.finfo(columns.dtype).eps
     rest = jnp.sum(curvature, axis=0, keepdims=True) - curvature
-    eigenvalues, vectors = jnp.linalg.eigh(rest)
+    # One by one on a CPU: of a batch, jaxlib before 0.11 waits for threads that devices of one
+    # process keep from each other, for ever where they are as many as its threads.
+    eigenvalues, vectors = jax.vmap(one_by_one_on_cpu(jnp.linalg.eigh))(rest)
     along = jnp.einsum("bji,bj->bi", vectors, jnp.sum(slope, axis=0, keepdims=True) - slope)
     moves = jnp.einsum("bij,bj->bi", vectors, along / jnp.maximum(eigenvalues, floor))
     is_used = jnp.any(curvature != 0, axis=(1, 2))

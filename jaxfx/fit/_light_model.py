@@ -197,7 +197,9 @@ def _ridge_colors(
     lengths = jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1)), 1)
     ridge = _RIDGE * jnp.sqrt(jnp.finfo(gram.dtype).eps) * jnp.eye(len(basis), dtype=gram.dtype)
     scaled = gram / lengths[:, :, None] / lengths[:, None, :] + ridge[None]
-    solved = jnp.linalg.solve(scaled, (right / lengths)[..., None])[..., 0]
+    # No batch, for the reason that `_jackknife` has.
+    pairs = zip(scaled, right / lengths, strict=True)
+    solved = jnp.stack([jnp.linalg.solve(matrix, vector) for matrix, vector in pairs])
     return (solved / lengths).T
 
 

@@ -19,7 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxfx._checks import is_concrete
-from jaxfx._loops import while_loop
+from jaxfx._loops import varying_as, while_loop
 from jaxfx.fit._descent import GAIN, PATIENCE, End, verdict
 from jaxfx.fit._light_errors import LEAST_NOISE, brightness, linearized
 from jaxfx.fit._light_model import (
@@ -182,6 +182,7 @@ def _search_in_program(
         )
 
     start = start._replace(is_last=jnp.asarray(not is_robust))
+    start = varying_as((search, reference, base_weight), start)
     steps = jax.eval_shape(lambda at: once(at)[0].losses, start)
     length = sum(math.prod(loss.shape) for loss in steps)
     start = start._replace(losses=jnp.full((most, length), jnp.nan, float))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfx._checks import is_concrete
-from jaxfx._loops import scan
+from jaxfx._loops import scan, varying_as
 from jaxfx.fit._descent import End
 from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps, report
 from jaxfx.fit._reduction import reduced, shrunk, thinned
@@ -72,7 +72,7 @@ def search(
         return eqx.tree_at(lambda m: m.scale, first, _scale(report(first, twist)[2]))
 
     small = _small(views)
-    twist, losses = jnp.zeros(6, float), []
+    twist, losses = varying_as(views, jnp.zeros(6, float)), []
     sharpest, *coarse = reversed(_sigmas(min(small.reference.shape[:2])))
 
     def sharpened(twist: Array, sigma: Any) -> tuple[Array, list[Array]]:

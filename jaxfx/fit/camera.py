@@ -205,7 +205,7 @@ def camera(
 
     if not is_concrete(views):
         quiet = functools.partial(fitted_to, bar=Bar(False, "fit"))
-        return fitted_under_transform(quiet, views, "camera", throw, progress)
+        return fitted_under_transform(quiet, views, "camera", throw, progress, solver)
     with Bar(progress, "fit") as bar:
         fitted = fitted_to(views, bar)
     if throw:

@@ -270,7 +270,7 @@ def dof(
 
     if is_traced:
         quiet = functools.partial(fitted_to, bar=Bar(False, "fit"))
-        return fitted_under_transform(quiet, model, "dof", throw, progress)
+        return fitted_under_transform(quiet, model, "dof", throw, progress, solver)
     with Bar(progress, "fit") as bar:
         fitted = fitted_to(model, bar)
     if throw:

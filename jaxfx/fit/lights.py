@@ -244,7 +244,7 @@ def lights(
     data = start, reference, gbuffer, camera, base_weight, visibilities
     if not is_concrete(data):
         quiet = partial(fitted_to, bar=Bar(False, "fit"))
-        return fitted_under_transform(quiet, data, "lights", throw, progress)
+        return fitted_under_transform(quiet, data, "lights", throw, progress, solver)
     with Bar(progress, "fit") as bar:
         fitted = fitted_to(data, bar)
     if throw:

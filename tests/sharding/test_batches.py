@@ -15,20 +15,26 @@ QUICK = ("dof.gather", "shadow.edge_pcf")
 MESHES = ("explicit", "auto", "shard_map")
 
 
-# Public functions that no batch of images goes through: files, meshes, measurements and plans
-# run Python until they are done; the reference of many pinhole images calls a renderer.
+# Public functions that no batch of images goes through, and why.
 NO_BATCH = {
-    *("blur.binomial_weights", "dof.accumulate", "relight.capture_normals"),
-    *("shadow.candidates", "shadow.light_cameras", "sharding.rows", "sharding.target_rows"),
-    *("budget.accumulate", "budget.dof", "budget.relight", "budget.reproject", "budget.shadow"),
+    # Files and tables of the host.
     *("exr.read", "exr.read_gbuffer", "exr.read_rgbd", "exr.write", "exr.write_gbuffer"),
     *("io.linear_from_srgb", "io.read_color", "io.read_depth", "io.read_png"),
-    *("io.srgb_from_linear", "io.write_png"),
+    *("io.srgb_from_linear", "io.write_png", "blur.binomial_weights"),
+    # Meshes, which OpenGL and Embree draw and trace on the host; rays and occlusion too.
     *("scene.default_camera", "scene.default_lights", "scene.depth", "scene.from_trimesh"),
     *("scene.gbuffer", "scene.gbuffer_along", "scene.load", "scene.material_ids"),
-    *("scene.object_ids", "scene.occlusion", "fit.focal_stack"),
-    *("scene.plan_views", "scene.still_life", "scene.transfer", "scene.visible"),
+    *("scene.object_ids", "scene.occlusion", "scene.plan_views", "scene.still_life"),
+    *("scene.transfer", "scene.visible"),
+    # Searches, plans and measurements in Python, which look at what they have found so far.
+    *("budget.accumulate", "budget.dof", "budget.relight", "budget.reproject", "budget.shadow"),
     *("tradeoff.measure", "tradeoff.pareto", "tradeoff.plot", "tradeoff.save"),
+    "fit.focal_stack",
+    # They are given a function, a renderer or an effect, which they call.
+    *("dof.accumulate", "relight.capture_normals", "sharding.rows", "sharding.target_rows"),
+    # No image: cameras of a light. No floats: the pixels that `shadow.edge_pcf` filters, by its
+    # own code.
+    *("shadow.light_cameras", "shadow.candidates"),
 }
 
 
@@ -76,8 +82,8 @@ def test_every_function_and_its_gradient_are_computed_where_a_batch_lies(
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("mesh", MESHES)
 @pytest.mark.parametrize("name", ["dof.scatter", "reproject.warp"])
+@pytest.mark.parametrize("mesh", MESHES)
 def test_a_batch_lies_along_one_axis_of_two(eight_devices, name, mesh):
     """On the other axis its devices hold the same, and are known to."""
     grid = {"shape": (4, 2), "names": ("batch", "other")}

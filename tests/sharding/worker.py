@@ -57,8 +57,12 @@ def mesh_of(kind, shape=(DEVICES,), names=("batch",)):
     return mesh
 
 
-def stacked(name, size):
-    """The function of a case, with its gradient or without, and a batch of its arguments."""
+@functools.lru_cache(maxsize=1)  # A case is asked for mesh after mesh.
+def stacked(name, gradient, size):
+    """A case as a function of one member and of a batch, its arguments, and its results.
+
+    These are those of the function of a batch on one device, the members' results first.
+    """
     cases = [CASES[name].split(eqx.is_array, size=size, seed=seed) for seed in range(DEVICES)]
     call = cases[0][0]
 
@@ -68,15 +72,7 @@ def stacked(name, size):
         return out, pull(out)[0]
 
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(case[1] for case in cases))
-    return call, with_gradient, batch
-
-
-def batch(name, mesh, gradient=True, size=(9, 7), shape=(DEVICES,), names=("batch",)):
-    """A batch of a case over eight devices against one device."""
-    call, with_gradient, batch = stacked(name, size)
     each = jax.vmap(with_gradient if gradient else call)
-    if not gradient or mesh == "shard_map":
-        return divided(each, batch, mesh, shape, names)
 
     def energy(floats, others):
         out = jax.vmap(call)(eqx.combine(floats, others))
@@ -85,23 +81,40 @@ def batch(name, mesh, gradient=True, size=(9, 7), shape=(DEVICES,), names=("batc
 
     def both(batch):
         """The gradient of each member, and that of a sum over all members."""
-        return each(batch), jax.grad(energy)(*eqx.partition(batch, eqx.is_inexact_array))
+        slope = jax.grad(energy) if gradient else lambda floats, others: ()
+        return each(batch), slope(*eqx.partition(batch, eqx.is_inexact_array))
 
-    return divided(both, batch, mesh, shape, names)
+    expected = jax.jit(each)(batch)
+    # The gradient of a sum has those of its members.
+    return each, both, batch, (expected, expected[1] if gradient else ())
+
+
+def batch(name, mesh, gradient=True, size=(9, 7), shape=(DEVICES,), names=("batch",)):
+    """A batch of a case over eight devices against one device."""
+    each, both, batch, expected = stacked(name, gradient, tuple(size))
+    if mesh == "shard_map":  # A sum over all members is more than one device's.
+        return divided(each, batch, expected[0], mesh, shape, names)
+    return divided(both, batch, expected, mesh, shape, names)
+
+
+@functools.lru_cache(maxsize=1)
+def frames(name):
+    """A fit as a function of a batch of frames or starts, that batch, and what is found."""
+    fitted, data = FITS[name](DEVICES)
+    each = jax.vmap(lambda data: fitted(*data))
+    return each, data, jax.jit(each)(data)
 
 
 def fits(name, mesh):
     """A fit of each of eight frames or starts, over eight devices against one device."""
-    fitted, data = FITS[name](DEVICES)
-    return divided(jax.vmap(lambda data: fitted(*data)), data, mesh)
+    return divided(*frames(name), mesh)
 
 
-def divided(mapped, batch, mesh, shape=(DEVICES,), names=("batch",)):
-    """A function of a batch over eight devices against one device.
+def divided(mapped, batch, expected, mesh, shape=(DEVICES,), names=("batch",)):
+    """A function of a batch over eight devices against its results on one device.
 
     `mesh` is "explicit" or "auto", for `jit(vmap(f))`, or "shard_map".
     """
-    expected = jax.jit(mapped)(batch)
     devices, spec = mesh_of(mesh, shape, names), PartitionSpec(names[0])
     placed = jax.device_put(batch, NamedSharding(devices, spec))
     if mesh == "shard_map":
@@ -156,39 +169,50 @@ BY_ROWS = {
 }
 
 
-def rows(name, mesh, height):
-    """An effect of an image whose rows lie on eight devices, and its gradient."""
-    halo, align, effect, which, others = BY_ROWS[name]
+def pulled_back(effect, static):
+    """A program of images and other arrays: the effect, and the pull-back of its own result."""
+
+    def call(images, arrays):
+        run = lambda *data: effect(*data[0], **eqx.combine(data[1], static))
+        out, pull = jax.vjp(run, images, arrays)
+        return out, pull(out)
+
+    return jax.jit(call)
+
+
+@functools.lru_cache(maxsize=1)
+def whole(name, height):
+    """The images of a case of rows, its other arguments, and its result on one device."""
+    _, _, effect, which, others = BY_ROWS[name]
     image, depth, seen = picture(height)
     given = image, depth, seen
     if which == 4:  # The second layer lies behind the first.
         given = image, depth, image[::-1], depth + 1 + depth[::-1]
     images = given[which if isinstance(which, slice) else slice(which)]
+    arrays, static = eqx.partition(others, eqx.is_array)
+    return images, arrays, static, pulled_back(effect, static)(images, arrays)
+
+
+def rows(name, mesh, height, counts=False):
+    """An effect of an image whose rows lie on eight devices, and its gradient."""
+    halo, align, effect, *_ = BY_ROWS[name]
+    images, arrays, static, expected = whole(name, height)
     devices = mesh_of(mesh)
     divided = sharding.rows(effect, devices, halo=halo, align=align)
-    arrays, static = eqx.partition(others, eqx.is_array)
-
-    def with_gradient(effect):
-        def call(images, arrays):
-            run = lambda *data: effect(*data[0], **eqx.combine(data[1], static))
-            out, pull = jax.vjp(run, images, arrays)
-            return out, pull(out)
-
-        return jax.jit(call)
-
-    expected = with_gradient(effect)(images, arrays)
     is_even = height % (DEVICES * align) == 0
     placed = images
     if is_even:
         placed = jax.device_put(images, NamedSharding(devices, PartitionSpec("batch")))
-    compiled = with_gradient(divided).lower(placed, arrays).compile()
+    compiled = pulled_back(divided, static).lower(placed, arrays).compile()
     found = compiled(placed, arrays)
-    forward = jax.jit(lambda *images: divided(*images, **others)).lower(*placed).compile()
-    return {
+    answer = {
         "error": error(found, expected),
-        "collectives": collectives(forward),
         "is_spread": not is_even or found[0].sharding.spec[:1] == ("batch",),
     }
+    if counts:
+        values = lambda *images: divided(*images, **eqx.combine(arrays, static))
+        answer["collectives"] = collectives(jax.jit(values).lower(*placed).compile())
+    return answer
 
 
 def target_rows(mesh, height):
