@@ -5,6 +5,7 @@ over a floor: in closed form, without a shadow map.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +30,8 @@ CORNERS = np.array([[-0.55, -0.4], [0.45, 0.6]])  # Of the plate: least and most
 CAMERA = OrthographicCamera(SIZE / 4, [SIZE / 2, SIZE / 2], np.eye(4))
 # Where the maps were made: beside the lamp and the sun that are to be found.
 AT, TOWARDS = np.array([0.02, 0.03, 0.04]), np.array([0.0, 0.0, 1.0])
-LAMP = PointLight([0.1, -0.06, 0.0], [8.0, 7.0, 5.0], 0.4)
-SUN = DirectionalLight([0.06, -0.04, 1.0], [1.0, 0.9, 0.7], 0.2)
+LAMP: Any = PointLight([0.1, -0.06, 0.0], [8.0, 7.0, 5.0], 0.4)
+SUN: Any = DirectionalLight([0.06, -0.04, 1.0], [1.0, 0.9, 0.7], 0.2)
 
 
 @functools.cache
@@ -59,7 +60,7 @@ def is_lit(light, plate=True):
     return ~is_inside.all(axis=-1) | (not plate)
 
 
-def parts(light, count, is_round=False):
+def parts(light: Any, count, is_round=False):
     """Lights without an extent, in place of one with: of a square or of a disc."""
     # Sheared both ways, so that no two points cross an edge along an axis at once.
     i, j = np.mgrid[:count, :count] + 0.5
@@ -122,7 +123,7 @@ START = {
 }
 
 
-def found(image, kind, start=None, **options):
+def found(image, kind, start=None, **options) -> Any:
     given = {"visibilities": [moving(kind)], "loss": "squares", "throw": False} | options
     return fit.lights(image, floor(), CAMERA, [start or START[kind]], **given)
 
@@ -175,7 +176,7 @@ def test_colors_and_size_by_pcss(dtype):
     given = {"visibilities": [soft], "parameters": ["color", "light_size"]}
     start = PointLight(AT, np.ones(3), 0.2)
     image = photograph(at)
-    result = fit.lights(image, floor(dtype), CAMERA, [start], loss="squares", **given)
+    result: Any = fit.lights(image, floor(dtype), CAMERA, [start], loss="squares", **given)
     assert result.success
     np.testing.assert_allclose(result.lights[0].light_size, 0.4, rtol=0.04)
     np.testing.assert_allclose(result.lights[0].color, LAMP.color, rtol=0.005)
