@@ -68,13 +68,13 @@ def parts(light: Any, count, is_round=False):
     across = across / count - 0.5
     if is_round:
         across = across[np.hypot(*across.T) <= 0.5]
-    color = light.color / len(across)
+    color, size = light.color / len(across), light.light_size
     for x, y in across:
         if isinstance(light, DirectionalLight):
-            wide = 2 * np.tan(light.light_size / 2)
+            wide = 2 * np.tan(size / 2)
             yield DirectionalLight(light.direction + wide * np.array([x, y, 0.0]), color)
         else:
-            place = light.position + light.light_size * np.array([x, y, 0.0])
+            place = light.position + size * np.array([x, y, 0.0])
             yield PointLight(place, color)
 
 
