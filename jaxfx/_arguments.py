@@ -118,6 +118,7 @@ def alike(
     for index, light in enumerate(lights):
         visibility = None if visibilities is None else visibilities[index]
         numbers = () if visibility is None else visibility.shape[2:]
-        key = kinds.index(type(light)), getattr(light, "heights", ()), numbers
+        has_size = getattr(light, "light_size", None) is not None
+        key = kinds.index(type(light)), getattr(light, "heights", ()), has_size, numbers
         groups.setdefault(key, []).append(index)
     return [groups[key] for key in sorted(groups)]

@@ -6,6 +6,7 @@
 | a sun | `DirectionalLight(direction, color)` |
 | a lamp | `PointLight(position, color)` |
 | a lamp that shines into a cone | `SpotLight(position, direction, color, ...)` |
+| a light with an extent, for soft shadows | any of these three with a `light_size` |
 | soft light from all around, without highlights | `SphericalHarmonicsLight(coefficients)` |
 | the surroundings, from an image of all directions | `EnvironmentLight(image)` |
 """
@@ -55,6 +56,15 @@ def _direction(name: str, value: Any) -> Float[Array, "3"]:
     return direction
 
 
+def _light_size(name: str, value: Any) -> Float[Array, ""] | None:
+    """A size above 0, or None for a light without an extent; `ValueError` otherwise."""
+    if value is None:
+        return None
+    light_size = parameter(name, value)
+    check(name, light_size, lambda v: (v > 0) & (v < np.inf), "positive, or None")
+    return light_size
+
+
 @final
 class AmbientLight(eqx.Module):
     """The same light from everywhere: it casts no shadows and has no highlights.
@@ -88,8 +98,11 @@ class DirectionalLight(eqx.Module):
 
     - `direction`: 3, in which the light travels, in world space; any length but zero.
     - `color`: 3, linear RGB irradiance on a surface that faces it.
+    - `light_size`: how wide it appears, in radians; None for no extent. Shadows alone read it:
+      `shadow.MovingShadow`, or your own call of `shadow.pcss`.
 
-    **Raises:** `ValueError` for a wrong shape, a number that is not finite or a zero direction.
+    **Raises:** `ValueError` for a wrong shape, a number that is not finite, a zero direction or
+    a size that is not positive.
 
     **Gradient:** exact.
 
@@ -105,10 +118,12 @@ class DirectionalLight(eqx.Module):
 
     direction: Float[Array, "3"]
     color: Float[Array, "3"]
+    light_size: Float[Array, ""] | None
 
-    def __init__(self, direction: Any, color: Any):
+    def __init__(self, direction: Any, color: Any, light_size: Any = None):
         self.direction = _direction("DirectionalLight(direction)", direction)
         self.color = _color("DirectionalLight(color)", color)
+        self.light_size = _light_size("DirectionalLight(light_size)", light_size)
 
 
 @final
@@ -119,8 +134,11 @@ class PointLight(eqx.Module):
 
     - `position`: 3, in world space.
     - `color`: 3, linear RGB intensity: irradiance at distance 1.
+    - `light_size`: its diameter, in scene units; None for no extent. Shadows alone read it:
+      shading takes the light for a point.
 
-    **Raises:** `ValueError` for a wrong shape or a number that is not finite.
+    **Raises:** `ValueError` for a wrong shape, a number that is not finite or a size that is
+    not positive.
 
     **Gradient:** exact.
 
@@ -136,10 +154,12 @@ class PointLight(eqx.Module):
 
     position: Float[Array, "3"]
     color: Float[Array, "3"]
+    light_size: Float[Array, ""] | None
 
-    def __init__(self, position: Any, color: Any):
+    def __init__(self, position: Any, color: Any, light_size: Any = None):
         self.position = _vector("PointLight(position)", position)
         self.color = _color("PointLight(color)", color)
+        self.light_size = _light_size("PointLight(light_size)", light_size)
 
 
 @final
@@ -155,10 +175,11 @@ class SpotLight(eqx.Module):
     - `color`: 3, linear RGB intensity on the axis.
     - `inner_angle`, `outer_angle`: radians from the axis, `0 <= inner_angle < outer_angle <=
       pi`.
+    - `light_size`: its diameter, in scene units, as of a `PointLight`.
 
-    **Raises:** `ValueError` for a wrong shape, a number that is not finite, a zero direction or
-    angles out of order. Traced values are not checked: a cone whose angles are out of order is
-    dark.
+    **Raises:** `ValueError` for a wrong shape, a number that is not finite, a zero direction, a
+    size that is not positive or angles out of order. Traced values are not checked: a cone
+    whose angles are out of order is dark.
 
     **Gradient:** exact.
 
@@ -181,9 +202,16 @@ class SpotLight(eqx.Module):
     color: Float[Array, "3"]
     inner_angle: Float[Array, ""]
     outer_angle: Float[Array, ""]
+    light_size: Float[Array, ""] | None
 
     def __init__(
-        self, position: Any, direction: Any, color: Any, inner_angle: Any, outer_angle: Any
+        self,
+        position: Any,
+        direction: Any,
+        color: Any,
+        inner_angle: Any,
+        outer_angle: Any,
+        light_size: Any = None,
     ):
         self.position = _vector("SpotLight(position)", position)
         self.direction = _direction("SpotLight(direction)", direction)
@@ -199,6 +227,7 @@ class SpotLight(eqx.Module):
             lambda v: v > 0,
             "above `inner_angle` (outer_angle - inner_angle > 0)",
         )
+        self.light_size = _light_size("SpotLight(light_size)", light_size)
 
 
 @final

@@ -69,7 +69,7 @@ def try_merging(search: Search, brought: Energy, lights: Sequence[Light]) -> Non
 class Place(NamedTuple):
     """Where a light is, and how bright.
 
-    - `kind`: the name of its class.
+    - `kind`: the name of its class, and whether it has a size.
     - `where`: position, direction and angles, in scene units.
     - `bright`: the sum of its color's channels.
     """
@@ -90,7 +90,8 @@ class Place(NamedTuple):
         where = np.concatenate([position, *(reach * turn for turn in turns)])
         is_around = isinstance(light, SphericalHarmonicsLight)
         color = light.coefficients if is_around else light.color
-        return cls(type(light).__name__, where, float(jnp.abs(color).sum()))
+        extent = "" if getattr(light, "light_size", None) is None else " with a size"
+        return cls(type(light).__name__ + extent, where, float(jnp.abs(color).sum()))
 
     def joined(self, other: "Place") -> "Place":
         """Both as one, in their mean place by brightness."""

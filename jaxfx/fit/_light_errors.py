@@ -33,13 +33,20 @@ _APART = 3.0
 LEAST_NOISE = 1e-3
 
 # The largest standard error of a parameter that is determined: of a direction or an angle in
-# radians; of a position as a ratio to its distance from the lit points; of a color as the ratio
+# radians; of a position as a ratio to its distance from the lit points; of a size as a ratio to
+# it; of a color as the ratio
 # of what it adds to the image to the image itself, root mean squares.
 _MOST_ERROR = 0.2
 
 # The least contrast of an image, as a ratio to its root mean square: the contrast of an even
 # wall is noise, of which nothing can be explained.
 _LEAST_CONTRAST = 0.1
+
+# What it must change in an image that a light loses its size, as a ratio to what the derivative
+# says: a penumbra of many pixels and texels has 1, one of two texels of a shadow map a half.
+# With a smaller number sizes are stated that are those of texels; this one also refuses some
+# that are right, of penumbrae of one to two pixels.
+_LEAST_CHANGE = 0.5
 
 Errors = tuple[dict[str, Float[Array, "..."]], ...]
 
@@ -85,6 +92,7 @@ def evidence(
     errors = jnp.sqrt(jnp.maximum(variances, floor**2))
     projection = _null_projection(columns)
     is_untold = jnp.diagonal(projection) > _SHARED
+    is_untold = is_untold | _is_hidden(model, lights, columns, image, root)
     errors = jnp.where(is_untold | jnp.isnan(errors), jnp.inf, errors)
     owners = [i for i, values in enumerate(map(model.values, lights)) for _ in _flat(values)]
     by_light = _by_light(model, lights, errors)
@@ -100,6 +108,40 @@ def evidence(
         jnp.sum(jnp.where(is_reached, weight, 0)) / jnp.sum(base_weight),
         _explained(reference, base_weight, jnp.minimum(length[0], CUT * noise[0])),
     )
+
+
+def _is_hidden(
+    model: Model,
+    lights: tuple[Light, ...],
+    columns: Float[Array, "residual number"],
+    image: Float[Array, "height width 3"],
+    root: Float[Array, "height width 1"],
+) -> Bool[Array, " number"]:
+    """Which numbers are sizes whose penumbra no pixel shows.
+
+    There the image is as well explained by every smaller size, and the search ends at the
+    largest, where the derivative from above tells nothing of it. A shadow map knows none below
+    its texel. `columns` are weighted by `root`.
+    """
+    hidden, first = [], 0
+    for index, light in enumerate(lights):
+        for name, value in model.values(light).items():
+            own = jnp.zeros(len(value), bool)
+            if name == "light_size":
+                sharp = list(lights)
+                sharp[index] = with_values(light, {name: value * 1e-3})
+                without = _drawn(model, tuple(sharp)).astype(image.dtype)
+                change = jnp.linalg.norm(root * (without - image))
+                expected = jnp.linalg.norm(columns[:, first] * value)
+                own = ~(change >= _LEAST_CHANGE * expected)[None]
+            hidden.append(own)
+            first += len(value)
+    return jnp.concatenate(hidden)
+
+
+@eqx.filter_jit
+def _drawn(model, lights):
+    return model(lights)
 
 
 @eqx.filter_jit
@@ -176,6 +218,8 @@ def _untold(
             elif name == "position":
                 lit_point = mean_point(model.gbuffer, model.camera, lit)
                 size = jnp.linalg.norm(light.position - lit_point)
+            elif name == "light_size":
+                size = light.light_size
             unsure[-1][name] = ~(jnp.linalg.norm(own) <= _MOST_ERROR * size)
     return tuple(unsure)
 
@@ -195,7 +239,8 @@ def _by_light(
             own, rest = jnp.stack(rest[: len(value)]), rest[len(value) :]
             if name == "color" and isinstance(light, SphericalHarmonicsLight):
                 own = own.reshape(light.coefficients.shape)
-            by_light[-1][name] = jnp.sqrt(jnp.sum(own**2)) if name == "direction" else own
+            is_one = name in ("direction", "light_size")
+            by_light[-1][name] = jnp.sqrt(jnp.sum(own**2)) if is_one else own
     return tuple(by_light)
 
 

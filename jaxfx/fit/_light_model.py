@@ -38,8 +38,8 @@ _Camera = PinholeCamera | OrthographicCamera
 def free(light: Light, names: tuple[str, ...]) -> list[str]:
     """Those of the parameters that a light has."""
     fields = {"angles": ("inner_angle",), "color": ("color", "coefficients")}
-    has = lambda name: any(hasattr(light, field) for field in fields.get(name, (name,)))
-    return [name for name in names if has(name)]
+    has = lambda field: getattr(light, field, None) is not None
+    return [name for name in names if any(map(has, fields.get(name, (name,))))]
 
 
 def color_shape(light: Light) -> tuple[int, int]:
@@ -92,6 +92,8 @@ class Model(eqx.Module):
             values["color"] = light.coefficients.reshape(-1)
         if isinstance(light, SpotLight):
             values["angles"] = jnp.stack([light.inner_angle, light.outer_angle])
+        if (light_size := getattr(light, "light_size", None)) is not None:
+            values["light_size"] = light_size[None]
         return {name: values[name] for name in free(light, self.names)}
 
 
@@ -108,6 +110,8 @@ def with_values(light: Any, values: Values) -> Any:
         fields["direction"] = _turned(light.direction, values["direction"])
     if "angles" in values:
         fields["inner_angle"], fields["outer_angle"] = fields.pop("angles")
+    if "light_size" in values:
+        (fields["light_size"],) = values["light_size"]
     return type(light)(**fields)
 
 
@@ -134,7 +138,10 @@ class Search(eqx.Module):
     scale: Float[Array, ""]
 
     def unknowns(self) -> list[Values]:
-        """The unknowns of the start: zeros; for a cone, logits of its ratios of angles."""
+        """The unknowns of the start: zeros; for a cone, logits of its ratios of angles.
+
+        A size's is the logarithm of its ratio to the start's.
+        """
         unknowns = []
         for light in self.start:
             values = self.model.values(light)
@@ -157,6 +164,8 @@ class Search(eqx.Module):
             if "angles" in steps:
                 ratio, outer = jax.nn.sigmoid(steps["angles"]) * jnp.array([1, jnp.pi])
                 values["angles"] = jnp.stack([ratio * outer, outer])
+            if "light_size" in steps:
+                values["light_size"] = light.light_size * jnp.exp(steps["light_size"])
             moved.append(with_values(light, values))
         return moved
 

@@ -35,7 +35,7 @@ from jaxfx.gbuffer import GBuffer
 from jaxfx.light import Light
 
 
-LIGHT_PARAMETERS = ("color", "position", "direction", "angles")
+LIGHT_PARAMETERS = ("color", "position", "direction", "angles", "light_size")
 
 # What lights must meet to be called a success, both ratios: the least share of the weight that
 # counts in the end, and the least contrast that is explained. With a lower first bound a few
@@ -56,10 +56,11 @@ class LightsFit(eqx.Module):
       colors are fitted. It jumps where the pixels are reweighted.
     - `standard_errors`: for each light those of the parameters that were fitted, by name, in
       their units: 3 for the color (9 3 for coefficients) and the position, an angle in radians
-      for the direction, 2 (inner, outer) for the angles. From a jackknife: the residuals of 8 x
-      8 tiles of the image are taken for independent of one another, and no others. Never less
-      than what noise of a thousandth of the image's root mean square would make; inf where the
-      image does not depend on the parameter. Other minima are not in it.
+      for the direction, 2 (inner, outer) for the angles, a scalar for the size. From a
+      jackknife: the residuals of 8 x 8 tiles of the image are taken for independent of one
+      another, and no others. Never less than what noise of a thousandth of the image's root
+      mean square would make; inf where the image does not depend on the parameter. Other minima
+      are not in it, nor that a shadow map knows edges to a texel.
     - `alike`: booleans of shape light light: which lights, by their indices, the image can't
       tell apart: it stays the same, to a thousandth of what each change alone would do, when
       the parameters of both change together; or they are of one kind, and their positions and

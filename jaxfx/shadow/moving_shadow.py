@@ -10,11 +10,12 @@ from jaxfx._arguments import check_camera, check_gbuffer, check_light
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, check, check_map, parameter, whole_number
 from jaxfx._loops import scan
-from jaxfx._numerics import clip01
+from jaxfx._numerics import absolute, clip01, safe_divide
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import DirectionalLight, PointLight, SpotLight
+from jaxfx.shadow.pcss import penumbra
 
 
 _Camera = PinholeCamera | OrthographicCamera
@@ -26,7 +27,8 @@ class MovingShadow(eqx.Module):
     """The soft shadow of a light near to the one that a shadow map was made for.
 
     Called with a light, it gives the visibility of each pixel, with a derivative in the light's
-    direction or position: `fit.lights` finds a sun by it. The other shadows have none.
+    direction, position and size: `fit.lights` finds a sun by it. The other shadows have none in
+    where the light is.
 
     **Arguments:**
 
@@ -36,7 +38,8 @@ class MovingShadow(eqx.Module):
       the light's position for others.
     - `gbuffer`, `camera`: the cache of the image to shadow; `normal` and `depth` are read.
     - `softness`: scene units above a surface over which an occluder begins to count.
-    - `size`: static; odd, the kernel's width in texels.
+    - `size`: static; odd, the kernel's width in texels. That of a light with a `light_size` is
+      as wide as its penumbra, and cut to this.
 
     **Raises:** `ValueError` for a wrong shape, a softness that is not positive or an even size.
 
@@ -62,10 +65,17 @@ class MovingShadow(eqx.Module):
     as far as it lies above the receiver's tangent plane and nearer to the light, so that no
     plane shadows itself, however wide the kernel.
 
+    A light with a `light_size` is taken for a square of that side, along the map's rows and
+    columns. What a texel covers of it is the overlap of two squares: the texel, and the light
+    as it is seen through the texel's plane, so that each occluder has its own penumbra. Covered
+    is their sum, which counts twice where one occluder lies behind another. A round light's
+    penumbra is about that of a square of 0.85 of its diameter.
+
     Surfaces that no ray of the map's light met are not in the map: the shadow holds for lights
     within about the width of the kernel. Farther away, render the map again.
 
-    Source: our own; the filter is Reeves, Salesin & Cook 1987, the kernel a cubic B-spline.
+    Source: our own; the filter is Reeves, Salesin & Cook 1987, the kernel a cubic B-spline;
+    that texels are projected back onto an area light is Guennebaud, Barthe & Paulin 2006's.
     """
 
     occluders: Float[Array, "rows columns 3"]
@@ -111,7 +121,8 @@ class MovingShadow(eqx.Module):
         **Raises:** `ValueError` for a light of another kind than the map's.
 
         **Gradient:** exact with respect to the light's direction, of a directional light, or
-        position, of the others.
+        position, of the others, and to its size. The size has none where the penumbra is
+        narrower than a texel or wider than the kernel may be.
         """
         is_parallel = isinstance(self.light_camera, OrthographicCamera)
         if not isinstance(light, DirectionalLight if is_parallel else PointLight | SpotLight):
@@ -130,20 +141,35 @@ def _visibility(shadow, light):
     place, depth = shadow.light_camera.project(receivers)
     first = jnp.floor(place).astype(jnp.int32) - size // 2
     projected = lambda points: _projected(shadow.light_camera, light, points)
-    here = projected(receivers)
+    here, moved_depth = projected(receivers)
+
+    def weight_at(point):
+        """The share of the light, or of the kernel, that a texel's point stands for."""
+        place, occluder_depth = projected(point)
+        if light.light_size is None:
+            # The spline is 4 wide and of sum 1. Stretched to `size` its sum grows by as much.
+            return jnp.prod(_spline((place - here) / (size / 4)) / (size / 4), axis=-1)
+        light_size = light.light_size.astype(depth.dtype)
+        width = penumbra(shadow.light_camera, light_size, moved_depth, occluder_depth)
+        # Of a light that is nearer to an occluder than the map's, texels lie farther apart.
+        is_straight = isinstance(shadow.light_camera, OrthographicCamera)
+        old_depth = shadow.light_camera.project(point)[1]
+        texel = 1.0 if is_straight else safe_divide(old_depth, occluder_depth)[..., None]
+        half_width = jnp.clip(width[..., None] / 2, texel / 2, size // 2)
+        overlap = clip01((half_width - absolute(place - here)) / texel + 0.5) * texel
+        return jnp.prod(overlap / (2 * half_width), axis=-1)
 
     def add(covered, tap):
         point, known = _read(shadow, first[..., 0] + tap % size, first[..., 1] + tap // size)
         above = jnp.sum((point - receivers) * shadow.normals, axis=-1)
         nearer = depth - shadow.light_camera.project(point)[1]
         height = jnp.where(known, jnp.minimum(above, nearer), 0)
-        # The spline is 4 wide and of sum 1. Stretched to `size` its sum grows by as much.
-        weight = jnp.prod(_spline((projected(point) - here) / (size / 4)) / (size / 4), axis=-1)
-        return covered + weight * _smoothstep(height / shadow.softness), None
+        return covered + weight_at(point) * _smoothstep(height / shadow.softness), None
 
     taps = jnp.arange(size**2, dtype=jnp.int32)
     covered, _ = scan(add, jnp.zeros_like(depth), taps)
-    return jnp.where(shadow.shown, 1 - _smoothstep(covered), 1)
+    dark = _smoothstep(covered) if light.light_size is None else clip01(covered)
+    return jnp.where(shadow.shown, 1 - dark, 1)
 
 
 def _read(
@@ -167,8 +193,8 @@ def _points(
 
 def _projected(
     camera: _Camera, light: _Moving, points: Float[Array, "height width 3"]
-) -> Float[Array, "height width 2"]:
-    """Pixels of the shadow map where a light that has moved would see points of the world.
+) -> tuple[Float[Array, "height width 2"], Float[Array, "height width"]]:
+    """Pixels of the shadow map where a light that has moved would see points; their depth.
 
     A directional light projects them along its rays onto the plane of the map's camera.
     """
@@ -177,10 +203,10 @@ def _projected(
         x, y, ahead = light.direction.astype(points.dtype) @ pose[:3, :3].astype(points.dtype)
         sideways = camera.pixels_per_unit.astype(points.dtype) * jnp.stack([x, y]) / ahead
         pixels, depth = camera.project(points)
-        return pixels - depth[..., None] * sideways[None, None]
+        return pixels - depth[..., None] * sideways[None, None], depth
     assert isinstance(camera, PinholeCamera) and not isinstance(light, DirectionalLight)
     moved = pose.at[:3, 3].set(light.position.astype(pose.dtype))
-    return PinholeCamera(camera.intrinsics, moved).project(points)[0]
+    return PinholeCamera(camera.intrinsics, moved).project(points)
 
 
 def _spline(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

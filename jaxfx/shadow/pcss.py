@@ -99,7 +99,7 @@ def _pcss(shadow_map, receivers, camera, bias, slope_bias, softness, light_size,
     count, total = sum_rows(occluders, size)
     occluder_depth = safe_divide(total, count)
     z = jnp.where(places.threshold > -jnp.inf, receivers.z.astype(dtype), 1)
-    width = _penumbra(camera, light_size.astype(dtype), z, occluder_depth)
+    width = penumbra(camera, light_size.astype(dtype), z, occluder_depth)
     width = jnp.where((count > 0) & (occluder_depth > 0), width, 0)
     half_width = jnp.clip(width / 2, 0.5, max(size // 2, 0.5))
 
@@ -122,7 +122,7 @@ def _pcss(shadow_map, receivers, camera, bias, slope_bias, softness, light_size,
     return (lit / (weights_down * sum(weights_across))).astype(receivers.z.dtype)
 
 
-def _penumbra(camera, light_size, z, occluder_depth):
+def penumbra(camera, light_size, z, occluder_depth):
     """The width of the penumbra at each receiver, in texels."""
     if isinstance(camera, OrthographicCamera):
         scale = 2 * jnp.tan(light_size / 2) * camera.pixels_per_unit.astype(z.dtype)
