@@ -129,7 +129,8 @@ def accumulate(
         weight = 1
         if iris is not None and points is not None:
             height, width, _ = image.shape
-            weight = let_through(iris, points, index, height, width, image.dtype)
+            point = points.unit[index], jnp.asarray(points.held[index])
+            weight = let_through(iris, *point, height, width, image.dtype)
             weight = jnp.maximum(weight, _LEAST)[..., None]
             image = weight * image
         weights = weights + weight

@@ -67,8 +67,9 @@ class Iris(eqx.Module):
     **Gradient:** exact with respect to all five numbers; `roundness`, `squeeze` and
     `vignetting` at the ends of their ranges have that of the side within.
 
-    Every sprite keeps its energy, also where the rim cuts it: an even picture stays even. A
-    real lens' picture gets darker towards its corners; `Iris.open_share` is how much.
+    A rim takes no light: each pixel's is spread over what is left of its shape, and an even
+    picture stays even. A real lens' picture gets darker towards its corners;
+    `Iris.open_share` is how much.
 
     **Example:**
 
@@ -224,23 +225,25 @@ def _are_held(iris: Iris, unit: Float[np.ndarray, "count 2"]) -> Bool[np.ndarray
     return held
 
 
+@ft.partial(jax.jit, static_argnames=("height", "width", "dtype"))
 def let_through(
-    iris: Iris, points: Points, index: int, height: int, width: int, dtype: Any
+    iris: Iris,
+    unit: Float[Array, "2"],
+    held: Bool[Array, " ring"],
+    height: int,
+    width: int,
+    dtype: Any,
 ) -> Float[Array, "height width"]:
-    """How much light one of the points lets through to each pixel; 1 for even light."""
-    center = None
-    if iris.vignetting is not None:
-        center = center_of(iris.vignetting.astype(dtype), field_of(height, width, dtype))
+    """How much light a point of `Points` lets through to each pixel; 1 for even light."""
+    light = jnp.zeros((height, width), dtype)
     rings = rings_of(iris)
     rings = jnp.ones(1, dtype) if rings is None else rings.astype(dtype)
-    light = jnp.zeros((height, width), dtype)
     for ring, scale in enumerate(ring_scales(iris)):
-        if not points.held[index, ring]:
-            continue
-        passes = jnp.ones((height, width), bool)
-        if center is not None:
-            point = points.unit[index].astype(dtype)[:, None, None] / scale
-            passes = jnp.sum((point - center) ** 2, axis=0) <= 1
+        passes = held[ring]
+        if iris.vignetting is not None:
+            center = center_of(iris.vignetting.astype(dtype), field_of(height, width, dtype))
+            point = unit.astype(dtype)[:, None, None] / scale
+            passes &= jnp.sum((point - center) ** 2, axis=0) <= 1
         light += jnp.where(passes, rings[ring], 0)
     return light
 

@@ -73,7 +73,8 @@ def rimmed(
     to_middle = middle - center[None]
     if toward is not None:
         normal_of_cut, distance = toward[None], -_dot(toward[None], center[None]) / 2
-        is_out = _dot(first, normal_of_cut) < -distance
+        # Where both circles are one, as if the disc had begun to move.
+        is_out = _dot(first, normal_of_cut) <= -distance
     else:
         # The line through both crossings of the piece's circle, or its line, with the disc's.
         if curvature is None:

@@ -47,7 +47,7 @@ def limits(iris, center, y):
     return np.where(is_there, start, 0), np.where(is_there, end, 0)
 
 
-SHAPES = [Iris(), Iris(5, 0.1, 0.6, 0.7), Iris(3, 0.4), Iris(6, 0.3), Iris(4, 0.1, 0.999)]
+SHAPES = [Iris(), Iris(5, 0.1, 0.6, 0.7), Iris(3, 0.4), Iris(6, 0.3), Iris(4, 0.1, 0.9)]
 
 
 @first(("iris", "dtype"), [(x, d) for d in ("float64", "float32") for x in SHAPES], 2)
@@ -97,12 +97,12 @@ def test_the_open_share_is_that_of_two_discs():
     np.testing.assert_allclose(slope, -2 / math.pi * np.hypot(*FIELD), atol=1e-12)
 
 
-@first("program", ["shift", "spans", "layered"], 3)
+@first("program", ["spans", "layered", "shift"])
 def test_a_light_has_the_light_of_each_point_of_the_lens(program):
     """Rings and rim, off the axis, by points of the lens that are counted pixel by pixel."""
-    size, at, radius, rings = (22, 24), (14, 8), 5.0, 3
+    size, at, radius, rings = (72, 70), (52, 16), 5.0, 3
     iris = Iris(5, 0.3, 0.5, 0.8, vignetting=0.9, profile=-0.7, rings=rings)
-    away = np.array([at[1] - 11.5, at[0] - 10.5]) / math.hypot(*size) * 2
+    away = np.array([at[1] - 34.5, at[0] - 35.5]) / math.hypot(*size) * 2
     close = 80
     line = (np.arange(-11 * close, 11 * close) + 0.5) / (2 * close) / radius
     rows = {}
@@ -125,15 +125,16 @@ def test_a_light_has_the_light_of_each_point_of_the_lens(program):
         result = dof.layered(image, depth, lens, behind=None, **options)
     else:
         result = dof.scatter(image, depth, lens, program=program, **options)
-    seen = np.asarray(result)[9:20, 3:14, 0]
-    assert abs(seen.sum() - 1) < 0.03  # Sprites near the frame fill less, and more is left.
+    seen = np.asarray(result)[47:58, 11:22, 0]
+    # All sprites are moved a little towards the middle, where there is then more light.
+    assert abs(seen.sum() - 1) < 0.1
     # Spans end sharply within a row; in sum, row by row, they are exact.
     expected, seen = expected / expected.sum(), seen / seen.sum()
-    np.testing.assert_allclose(seen.sum(axis=1), expected.sum(axis=1), atol=2e-3)
+    np.testing.assert_allclose(seen.sum(axis=1), expected.sum(axis=1), atol=5e-3)
     assert np.abs(seen - expected).sum() / 2 < 0.08
 
 
-@pytest.mark.parametrize("method", [dof.scatter, dof.layered])
+@first("method", [dof.scatter, dof.layered])
 def test_an_even_picture_stays_even(method):
     depth, lens = jnp.full((9, 12), 4.0), ThinLens(0.1, 2.0, 160.0)
     iris = Iris(vignetting=1.0, profile=0.8, rings=2)
@@ -183,8 +184,9 @@ def test_derivatives(program, iris):
     assert abs(slope[3] - both) < 2e-5
 
 
-WALL = PinholeCamera.from_fov(0.8, height=26, width=26)
-LENS = ThinLens.from_camera(WALL, aperture=0.6, focus_distance=2.0)
+SIDE = 64
+WALL = PinholeCamera.from_fov(0.8, height=SIDE, width=SIDE)
+LENS = ThinLens.from_camera(WALL, aperture=0.64, focus_distance=2.0)
 
 
 @first("method", [dof.scatter, dof.layered])
@@ -192,28 +194,25 @@ def test_effects_show_what_many_pinholes_show(method):
     """A light in a corner of a plane through the lens whose points `accumulate` weighs."""
 
     def render(camera):
-        pixels = pixel_centers(26, 26, camera.intrinsics.dtype)
-        points = camera.unproject(pixels, jnp.full((26, 26), 3.4, pixels.dtype))
-        width = 3.4 / WALL.intrinsics[0, 0]
-        is_lit = jnp.abs(points[..., :2] + 5.5 * width) <= width / 2
-        return is_lit.all(axis=-1).astype(pixels.dtype)[..., None]
+        pixels = pixel_centers(SIDE, SIDE, camera.intrinsics.dtype)
+        points = camera.unproject(pixels, jnp.full((SIDE, SIDE), 3.4, pixels.dtype))
+        away = points[..., :2] * WALL.intrinsics[0, 0] / 3.4 + 16
+        return jnp.exp(-jnp.sum(away**2, axis=-1))[..., None]
 
-    iris = Iris(vignetting=0.8, profile=-0.8, rings=4)
-    options = {"samples": 300, "jitter": False}
+    iris = Iris(vignetting=0.9, profile=-0.8, rings=4)
+    options = {"samples": 256, "jitter": False}
     expected = dof.accumulate(jax.jit(render), WALL, LENS, iris=iris, **options).image
-    image = render(WALL)
-    assert float(image.sum()) == 1
-    depth = jnp.full((26, 26), 3.4)
+    depth = jnp.full((SIDE, SIDE), 3.4)  # Circles of 10 pixels.
 
     def difference(iris):
-        seen = method(image, depth, LENS, max_coc=14.0, iris=iris)
+        seen = method(render(WALL), depth, LENS, max_coc=12.0, iris=iris)
         return float(jnp.abs(seen / seen.sum() - expected / expected.sum()).sum()) / 2
 
     found = difference(iris)
-    assert found < 0.12
-    # Without either, and with the rim on the other side, it is worse.
-    for other in (Iris(profile=-0.8, rings=4), Iris(vignetting=0.8)):
-        assert difference(other) > found + 0.05
+    assert found < 0.08
+    # Without the rim or the profile it is worse.
+    for other in (Iris(profile=-0.8, rings=4), Iris(vignetting=0.9)):
+        assert difference(other) > 2 * found
 
 
 def test_many_pinholes_have_the_slope_of_the_profile():
