@@ -50,7 +50,7 @@ def limits(iris, center, y):
 SHAPES = [Iris(), Iris(5, 0.1, 0.6, 0.7), Iris(3, 0.4), Iris(6, 0.3), Iris(4, 0.1, 0.9)]
 
 
-@first(("iris", "dtype"), [(x, d) for d in ("float64", "float32") for x in SHAPES], 2)
+@first(("iris", "dtype"), [(x, d) for d in ("float64", "float32") for x in SHAPES])
 def test_what_the_rim_leaves_has_area_and_mean_of_each_row(iris, dtype):
     """At each pixel, by lines that are close together."""
     radius, close = 3.3, 4000
@@ -87,13 +87,14 @@ def test_what_the_rim_leaves_has_area_and_mean_of_each_row(iris, dtype):
 
 
 def test_the_open_share_is_that_of_two_discs():
-    share = Iris(vignetting=0.8).open_share(*SIZE)
+    share_of = jax.jit(lambda vignetting: Iris(vignetting=vignetting).open_share(*SIZE))
+    share = share_of(0.8)
     away = 0.8 * np.hypot(*FIELD)
     expected = 2 * np.arccos(away / 2) - away / 2 * np.sqrt(4 - away**2)
     np.testing.assert_allclose(share, expected / math.pi, rtol=1e-12)
     assert (Iris(6).open_share(*SIZE) == 1).all()
     # From 0 on each pixel loses 2 / pi of its field.
-    slope = jax.jacfwd(lambda v: Iris(vignetting=v).open_share(*SIZE))(0.0)
+    slope = jax.jit(jax.jacfwd(share_of))(0.0)
     np.testing.assert_allclose(slope, -2 / math.pi * np.hypot(*FIELD), atol=1e-12)
 
 
@@ -148,7 +149,6 @@ SLOPES = [Iris(), Iris(5, 0.2, 0.3, 0.8), Iris(4, 0.3)]
 @first(
     ("program", "iris"),
     [(p, x) for x in SLOPES for p in ("shift", "spans", "layered")],
-    2,
 )
 def test_derivatives(program, iris):
     rng = np.random.default_rng(2)
@@ -189,7 +189,8 @@ WALL = PinholeCamera.from_fov(0.8, height=SIDE, width=SIDE)
 LENS = ThinLens.from_camera(WALL, aperture=0.64, focus_distance=2.0)
 
 
-@first("method", [dof.scatter, dof.layered])
+@pytest.mark.full
+@pytest.mark.parametrize("method", [dof.scatter, dof.layered])
 def test_effects_show_what_many_pinholes_show(method):
     """A light in a corner of a plane through the lens whose points `accumulate` weighs."""
 
