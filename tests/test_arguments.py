@@ -306,7 +306,17 @@ CALLS = {
         ft.partial(ThinLens.circle_of_confusion, LENS),
         {"depth": DEPTH},
     ),
-    "dof.Iris": (dof.Iris, {"blades": 6, "rotation": 0.1, "roundness": 0.2, "squeeze": 0.9}),
+    "dof.Iris": (
+        dof.Iris,
+        {
+            **{"blades": 6, "rotation": 0.1, "roundness": 0.2, "squeeze": 0.9},
+            **{"vignetting": 0.5, "profile": -0.5, "rings": 4},
+        },
+    ),
+    "dof.Iris.open_share": (
+        ft.partial(dof.Iris.open_share, dof.Iris(vignetting=0.5)),
+        {"height": 4, "width": 5},
+    ),
     "FocusPlanes": (FocusPlanes, {"near": 1.0, "focus": 2.0, "far": 3.0, "max_coc": 4.0}),
     "PinholeCamera": (
         PinholeCamera,

@@ -13,8 +13,13 @@ from jaxfx._checks import WholeNumber, check_image, parameter, whole_number
 from jaxfx._numerics import safe_sqrt, working_dtype
 from jaxfx._progress import counted
 from jaxfx.camera import PinholeCamera
-from jaxfx.dof.iris import Iris, check_iris, points_of
+from jaxfx.dof.iris import Iris, Points, check_iris, let_through, points_of
 from jaxfx.lens import ThinLens
+
+
+# Weight of a pass that a pixel does not see, beside about 1 for one that it does: of few passes
+# it may see none, and shows their mean. Larger, and it would show beside those that are seen.
+_LEAST = 1e-9
 
 
 class Accumulation(NamedTuple):
@@ -55,7 +60,8 @@ def accumulate(
     - `lens`: its `aperture` and `focus_distance` are used, in scene units.
     - `samples`: static; how many passes.
     - `iris`: the shape of the lens' opening; by default the disc. Its points are those of the
-      disc's sequence that lie in it.
+      disc's sequence that lie in it. With `vignetting` each pixel has the mean of the passes
+      whose points it sees past the rim; with a `profile` a mean weighted by that.
     - `jitter`: move each pass within a pixel too, which antialiases the mean by a box of one
       pixel.
     - `seed`: static; an integer from 0, scrambles the sequence in another way.
@@ -69,8 +75,9 @@ def accumulate(
     shapes.
 
     **Gradient:** that of `render`, through its camera: exact in the aperture, the focus
-    distance, the camera, and the iris' `rotation` and `squeeze`, where `render` is. A
-    rasteriser's is zero or missing. `roundness` must not be traced.
+    distance, the camera, and the iris' `rotation`, `squeeze` and `profile`, where `render` is;
+    with `vignetting` that of the rim is missing from those in `rotation`. A rasteriser's is
+    zero or missing. `roundness` and `vignetting` must not be traced.
 
     **Example:**
 
@@ -81,7 +88,9 @@ def accumulate(
     >>> dof.accumulate(lambda eye: jnp.ones((8, 8, 3)), camera, lens, samples=4).image.shape
     (8, 8, 3)
 
-    All cameras share the plane in focus.
+    All cameras share the plane in focus. Where the rim cuts the opening follows from the pixel
+    that light arrives at; in the effects, from the one that it comes from. They differ by
+    `vignetting` times the radius over half the diagonal.
 
     Source: Haeberli & Akeley 1990, the accumulation buffer. The sequence is Sobol's of 1967 in
     four dimensions, scrambled (Matousek 1998), by SciPy.
@@ -94,10 +103,15 @@ def accumulate(
     seed = whole_number("accumulate(seed=...)", seed, lambda n: n >= 0, "an integer from 0")
 
     offsets, shifts = lens_samples(samples, seed)
+    points = None
     if iris is not None:
-        check_iris("accumulate(iris=...)", iris)
-        offsets, shifts = iris_samples(iris, samples, seed)
+        iris = check_iris("accumulate(iris=...)", iris)
+        points, shifts = iris_samples(iris, samples, seed)
+        offsets = points.squeezed / 2
+        if iris.vignetting is None and iris.profile is None:
+            points = None
     total = half = dtype = None
+    weights = 0
     for index in counted(range(samples), progress, "lens"):
         offset = lens.aperture * jnp.asarray(offsets[index], lens.aperture.dtype)
         eye = camera.through_lens(offset, focus_distance=lens.focus_distance)
@@ -112,11 +126,19 @@ def accumulate(
                 "`accumulate(render)` must give images of one shape, got "
                 f"{total.shape}, then {image.shape}."
             )
+        weight = 1
+        if iris is not None and points is not None:
+            height, width, _ = image.shape
+            point = points.unit[index], jnp.asarray(points.held[index])
+            weight = let_through(iris, *point, height, width, image.dtype)
+            weight = jnp.maximum(weight, _LEAST)[..., None]
+            image = weight * image
+        weights = weights + weight
         total = image if total is None else total + image
         if index + 1 == samples // 2:
-            half = total / (samples // 2)
+            half = total / weights
     assert total is not None
-    mean = total / samples
+    mean = total / weights
     if half is None:
         return Accumulation(mean.astype(dtype), jnp.asarray(jnp.nan, mean.dtype))
     return Accumulation(mean.astype(dtype), _root_mean_square(half - mean))
@@ -144,13 +166,17 @@ def lens_samples(
 
 def iris_samples(
     iris: Iris, samples: int, seed: int = 0
-) -> tuple[Float[Array, "samples 2"], Float[np.ndarray, "samples 2"]]:
-    """The same for an iris: the first points of the disc's sequence that lie in it."""
+) -> tuple[Points, Float[np.ndarray, "samples 2"]]:
+    """The same for an iris: the first points of the disc's sequence that lie in it.
+
+    On a disc of radius 1.
+    """
     # The least share of the disc that an iris has: that of the triangle, 0.41.
     offsets, shifts = lens_samples(4 * samples + 16, seed)
-    held, turned = points_of(iris, 2 * offsets)
-    chosen = np.flatnonzero(held)[:samples]
-    return turned[chosen] / 2, shifts[chosen]
+    points = points_of(iris, 2 * offsets)
+    chosen = np.flatnonzero(points.held[:, -1])[:samples]
+    unit, squeezed, held = points
+    return Points(unit[chosen], squeezed[chosen], held[chosen]), shifts[chosen]
 
 
 def _shifted(camera: PinholeCamera, shift: Float[np.ndarray, "2"]) -> PinholeCamera:

@@ -6,6 +6,7 @@ is known by its chords, where a row of pixels cuts it and how much of it lies th
 
 import functools as ft
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, final
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from jaxfx._checks import (
     whole_number,
     with_numbers,
 )
+from jaxfx.dof.rim import Rim, arcs_in_strip, center_of, field_of, quarters, rimmed
 from jaxfx.dof.sprites import row_half_width
 
 
@@ -36,7 +38,9 @@ class Iris(eqx.Module):
 
     A point behind the focus is spread over this shape, one before it over the shape turned by
     half a turn. All shapes lie inside the disc: the circle of confusion stays the diameter of
-    the fully open, round lens, and blades cut a part of it away, as they do in Blender.
+    the fully open, round lens, and blades cut a part of it away, as they do in Blender. Off the
+    middle of the image the lens' rim may cut it (cat's eyes), and its light need not be even
+    (soap bubbles, creamy blur).
 
     **Arguments:**
 
@@ -46,12 +50,26 @@ class Iris(eqx.Module):
       are straight, at 1 they make the disc. Of no effect without blades.
     - `squeeze`: a ratio, above 0 and up to 1: the opening's width over that without squeeze,
       along x, whatever the rotation. An anamorphic lens of factor 2 has 0.5.
+    - `vignetting`: a ratio, 0 to 1, of optical vignetting: how far the lens' rim, a disc of the
+      lens' radius, has moved at the image's corner, in radii; in proportion nearer the middle.
+      It moves against the field: below the middle of the image upwards. What lies in the
+      opening and in the rim is left; both are squeezed. 0 is none.
+    - `profile`: a ratio, -1 to 1: from a soap bubble, dark within and bright at the rim, to a
+      creamy blur, bright within; 0 is even. Its light per area is
+      `1 + profile * (1 - 2 r**2)` times that of the even one, with r from 0 in the middle to 1
+      at the outline.
+    - `rings`: static; how many steps of equal area stand for that profile, each of the shape of
+      the opening. The time grows with it; without a profile it is of no effect.
 
-    **Raises:** `ValueError` for 1 or 2 blades, or a number out of its range. Traced values
-    can't be looked at: there a ratio out of range makes every pixel NaN.
+    **Raises:** `ValueError` for 1 or 2 blades, no rings, or a number out of its range. Traced
+    values can't be looked at: there a ratio out of range makes every pixel NaN.
 
-    **Gradient:** exact with respect to all three numbers; `roundness` and `squeeze` at the ends
-    of their ranges have that of the side within.
+    **Gradient:** exact with respect to all five numbers; `roundness`, `squeeze` and
+    `vignetting` at the ends of their ranges have that of the side within.
+
+    A rim takes no light: each pixel's is spread over what is left of its shape, and an even
+    picture stays even. A real lens' picture gets darker towards its corners;
+    `Iris.open_share` is how much.
 
     **Example:**
 
@@ -61,14 +79,21 @@ class Iris(eqx.Module):
 
     Source: the chord and the area of a circular segment are textbook geometry; blades as arcs
     of equal curvature between corners on the disc are our own model.
+    Cutting the opening by a disc that moves across the field is the usual model of optical
+    vignetting; the profile, and its steps, are our own.
     """
 
-    SHAPES: ClassVar = {"rotation": (), "roundness": (), "squeeze": ()}
+    SHAPES: ClassVar = dict.fromkeys(
+        ("rotation", "roundness", "squeeze", "vignetting", "profile"), ()
+    )
 
     blades: int = eqx.field(static=True)
     rotation: Float[Array, ""]
     roundness: Float[Array, ""] | None
     squeeze: Float[Array, ""]
+    vignetting: Float[Array, ""] | None
+    profile: Float[Array, ""] | None
+    rings: int = eqx.field(static=True)
 
     def __repr__(self) -> str:
         return with_numbers(self)
@@ -79,6 +104,9 @@ class Iris(eqx.Module):
         rotation: Any = 0.0,
         roundness: Any = 0.0,
         squeeze: Any = 1.0,
+        vignetting: Any = 0.0,
+        profile: Any = 0.0,
+        rings: WholeNumber = 8,
     ):
         is_count = lambda n: n == 0 or n >= _FEWEST
         self.blades = whole_number("Iris(blades)", blades, is_count, "0, or an integer from 3")
@@ -89,9 +117,44 @@ class Iris(eqx.Module):
         check("Iris(roundness)", bend, lambda v: (v >= 0) & (v <= 1), "from 0 to 1")
         is_ratio = lambda v: (v > 0) & (v <= 1)
         check("Iris(squeeze)", self.squeeze, is_ratio, "above 0 and at most 1")
+        self.vignetting = moved = parameter("Iris(vignetting)", vignetting)
+        self.profile = parameter("Iris(profile)", profile)
+        self.rings = whole_number("Iris(rings)", rings)
+        check("Iris(vignetting)", moved, lambda v: (v >= 0) & (v <= 1), "from 0 to 1")
+        check("Iris(profile)", self.profile, lambda v: abs(v) <= 1, "from -1 to 1")
+
+    def open_share(
+        self, height: WholeNumber, width: WholeNumber
+    ) -> Float[Array, "rows columns"]:
+        """How much of the opening each pixel of an image sees past the rim.
+
+        A picture times this gets darker towards its corners, as by optical vignetting.
+
+        **Arguments:** `height`, `width`: static; of the image, in pixels.
+
+        **Returns:** rows columns, a ratio: 1 on the axis, and everywhere without `vignetting`.
+
+        **Raises:** `ValueError` where the size is none.
+
+        **Gradient:** exact.
+
+        **Example:**
+
+        >>> from jaxfx.dof import Iris
+        >>> print(f"{Iris(vignetting=1.0).open_share(201, 201)[0, 0]:.2f}")
+        0.39
+        """
+        size = (
+            whole_number("open_share(height)", height),
+            whole_number("open_share(width)", width),
+        )
+        dtype = self.squeeze.dtype
+        if self.vignetting is None:
+            return jnp.ones(size, dtype)
+        return areas(outline(self, dtype, size)) / self.area()
 
     def area(self) -> Float[Array, ""]:
-        """The area of the opening, where the disc's radius is 1.
+        """The area of the opening, where the disc's radius is 1, as one on the axis sees it.
 
         **Returns:** a scalar, without unit: pi for the disc.
 
@@ -109,66 +172,118 @@ class Iris(eqx.Module):
         return self.blades * (triangle + segment).astype(squeeze.dtype) * squeeze
 
     def _valid_squeeze(self) -> Float[Array, ""]:
-        """NaN where it or the roundness is out of its range."""
+        """NaN where it or another number is out of its range."""
         is_valid = (self.squeeze > 0) & (self.squeeze <= 1)
-        if self.roundness is not None:
-            is_valid &= (self.roundness >= 0) & (self.roundness <= 1)
+        for ratio, least in ((self.roundness, 0), (self.vignetting, 0), (self.profile, -1)):
+            if ratio is not None:
+                is_valid &= (ratio >= least) & (ratio <= 1)
         return jnp.where(is_valid, self.squeeze, jnp.nan)
 
 
-def points_of(
-    iris: Iris, unit: Float[np.ndarray, "count 2"]
-) -> tuple[Bool[np.ndarray, " count"], Float[Array, "count 2"]]:
-    """Which points of the unit disc an iris holds before it is turned and squeezed.
+class Points(NamedTuple):
+    """Points of a lens and what they let through.
 
-    And all the points, turned and squeezed with it: the derivative is exact in `rotation` and
-    `squeeze`. `roundness` must be concrete.
+    - `unit`: x and y on the unit disc, turned with the iris and not squeezed.
+    - `squeezed`: the same squeezed: the derivative is exact in `rotation` and `squeeze`.
+    - `held`: for each ring from the middle on whether it holds the point; one for even light.
     """
-    bend = 0.0 if iris.roundness is None else iris.roundness
-    if not is_concrete(bend):
-        raise ValueError(
-            "`accumulate(iris.roundness)` must be concrete, which says what points the iris "
-            "holds, got a traced number."
-        )
-    held = np.ones(len(unit), bool)
-    half = math.sin(math.pi / max(iris.blades, 1))
-    for k in range(iris.blades):
-        curvature, angle = float(bend), (2 * k + 1) * math.pi / iris.blades
-        normal = np.array([math.cos(angle), math.sin(angle)])
-        away = unit - math.cos(math.pi / iris.blades) * normal
-        bulge = curvature / 2 * ((away**2).sum(axis=1) - half**2)
-        held &= bulge + math.sqrt(1 - (curvature * half) ** 2) * (away @ normal) <= 0
+
+    unit: Float[Array, "count 2"]
+    squeezed: Float[Array, "count 2"]
+    held: Bool[np.ndarray, "count ring"]
+
+
+def points_of(iris: Iris, unit: Float[np.ndarray, "count 2"]) -> Points:
+    """Points of the unit disc, by an iris before it is turned and squeezed.
+
+    `roundness` and `vignetting` must be concrete.
+    """
+    for name in ("roundness", "vignetting"):
+        if not is_concrete(getattr(iris, name)):
+            raise ValueError(
+                f"`accumulate(iris.{name})` must be concrete, which says what points the iris "
+                "holds, got a traced number."
+            )
+    held = np.stack([_are_held(iris, unit / scale) for scale in ring_scales(iris)], axis=1)
     sine, cosine = jnp.sin(iris.rotation), jnp.cos(iris.rotation)
     x, y = jnp.asarray(unit, iris.rotation.dtype).T
-    turned = [iris.squeeze.astype(x.dtype) * (cosine * x - sine * y), sine * x + cosine * y]
-    return held, jnp.stack(turned, axis=1)
+    turned = [cosine * x - sine * y, sine * x + cosine * y]
+    squeezed = [iris.squeeze.astype(x.dtype) * turned[0], turned[1]]
+    return Points(jnp.stack(turned, axis=1), jnp.stack(squeezed, axis=1), held)
+
+
+def _are_held(iris: Iris, unit: Float[np.ndarray, "count 2"]) -> Bool[np.ndarray, " count"]:
+    bend = 0.0 if iris.roundness is None else float(iris.roundness)
+    held = (unit**2).sum(axis=1) <= 1
+    half = math.sin(math.pi / max(iris.blades, 1))
+    for k in range(iris.blades):
+        angle = (2 * k + 1) * math.pi / iris.blades
+        normal = np.array([math.cos(angle), math.sin(angle)])
+        away = unit - math.cos(math.pi / iris.blades) * normal
+        bulge = bend / 2 * ((away**2).sum(axis=1) - half**2)
+        held &= bulge + math.sqrt(1 - (bend * half) ** 2) * (away @ normal) <= 0
+    return held
+
+
+@ft.partial(jax.jit, static_argnames=("height", "width", "dtype"))
+def let_through(
+    iris: Iris,
+    unit: Float[Array, "2"],
+    held: Bool[Array, " ring"],
+    height: int,
+    width: int,
+    dtype: Any,
+) -> Float[Array, "height width"]:
+    """How much light a point of `Points` lets through to each pixel; 1 for even light."""
+    light = jnp.zeros((height, width), dtype)
+    rings = rings_of(iris)
+    rings = jnp.ones(1, dtype) if rings is None else rings.astype(dtype)
+    for ring, scale in enumerate(ring_scales(iris)):
+        passes = held[ring]
+        if iris.vignetting is not None:
+            center = center_of(iris.vignetting.astype(dtype), field_of(height, width, dtype))
+            point = unit.astype(dtype)[:, None, None] / scale
+            passes &= jnp.sum((point - center) ** 2, axis=0) <= 1
+        light += jnp.where(passes, rings[ring], 0)
+    return light
+
+
+def ring_scales(iris: Iris) -> tuple[float, ...]:
+    """The outline of each ring over that of the opening."""
+    count = 1 if iris.profile is None else iris.rings
+    return tuple(math.sqrt((k + 1) / count) for k in range(count))
 
 
 def check_iris(name: str, iris: Any) -> Iris:
-    """The iris, without a roundness that is known to be 0; `ValueError` unless it is one.
+    """The iris, without what is known to be 0; `ValueError` unless it is one.
 
-    To a compiled program that is another type of argument: that of straight blades is quicker.
+    To a compiled program that is another type of argument: that of straight blades is quicker,
+    and so is that of an opening that no rim cuts, or of even light.
     """
     if not isinstance(iris, Iris):
         raise ValueError(f"`{name}` must be an Iris, got {type(iris).__name__}.")
-    bend = iris.roundness
-    zero = eqx.tree_at(lambda x: x.roundness, iris, iris.squeeze, is_leaf=lambda x: x is None)
-    check_fields(name, iris if bend is not None else zero)
-    if iris.blades and not (bend is None or (is_concrete(bend) and float(bend) == 0)):
-        return iris
-    return eqx.tree_at(lambda iris: iris.roundness, iris, None)
+    parts = lambda iris: (iris.roundness, iris.vignetting, iris.profile)
+    is_none = lambda x: x is None
+    given = [iris.squeeze if part is None else part for part in parts(iris)]
+    check_fields(name, eqx.tree_at(parts, iris, tuple(given), is_leaf=is_none))
+    bend, moved, profile = (
+        None if part is None or (is_concrete(part) and float(part) == 0) else part
+        for part in parts(iris)
+    )
+    parted = bend if iris.blades else None, moved, profile
+    return eqx.tree_at(parts, iris, parted, is_leaf=is_none)
 
 
 class Pieces(NamedTuple):
     """Parts of an outline along which y does not turn, in radii of the disc.
 
-    - `start`, `end`: x and y of both ends.
+    - `start`, `end`: x and y of both ends; per pixel, along the last axes, where a rim cuts.
     - `middle`, `normal`: of the chord of the arc of which this is a part: its midpoint, and the
       direction outwards.
     """
 
-    start: Float[Array, "*piece 2"]
-    end: Float[Array, "*piece 2"]
+    start: Float[Array, "..."]
+    end: Float[Array, "..."]
     middle: Float[Array, "*piece 2"]
     normal: Float[Array, "*piece 2"]
 
@@ -182,17 +297,116 @@ class Outline(NamedTuple):
     - `half`: half of the length of each line or arc's chord.
     - `curvature`: that of each arc; none for lines.
     - `squeeze`: what x is finally multiplied by.
+    - `rim`: the second disc, which has cut the pieces, per pixel; None where there is none.
+    - `rings`: how much brighter each ring is than the next one outwards, the last one than
+      nothing, where even light is 1; None for even light.
     """
 
     pieces: Pieces | None
     half: float
     curvature: Float[Array, ""] | None
     squeeze: Float[Array, ""]
+    rim: Rim | None = None
+    rings: Float[Array, " ring"] | None = None
 
 
-def outline(iris: Iris, dtype: Any) -> Outline:
-    """The pieces of an iris' outline, in `dtype`."""
+def outline(iris: Iris, dtype: Any, size: tuple[int, ...] = ()) -> Outline:
+    """The pieces of an iris' outline, in `dtype`.
+
+    Per pixel of an image of that `size`, height and width, if the iris has a `vignetting`.
+    """
     iris = jax.tree.map(lambda x: x.astype(dtype), iris)
+    whole = _uncut(iris, dtype)._replace(rings=rings_of(iris))
+    if iris.vignetting is None:
+        return whole
+    height, width = size
+    field = field_of(height, width, dtype)
+    center = center_of(iris.vignetting, field)
+    if whole.pieces is None:
+        corners, normals = quarters(dtype)
+        middle = math.sqrt(0.5) * normals
+        pieces = Pieces(corners, jnp.roll(corners, -1, axis=0), middle, normals)
+        half, curvature = math.sqrt(0.5), jnp.ones((), dtype)
+        square = jnp.sum(field * field, axis=0)
+        is_aside = square > 0
+        x = jnp.where(is_aside, 1 / jnp.sqrt(jnp.where(is_aside, square, 1)), 0)[None] * field
+        toward = jnp.where(is_aside[None], -x, jnp.array([1, 0], dtype)[:, None, None])
+    else:
+        pieces, half, curvature, toward = whole.pieces, whole.half, whole.curvature, None
+        if curvature is not None:
+            # Both halves of each arc after one another.
+            order = np.arange(len(pieces.start)).reshape(2, -1).T.ravel()
+            pieces = jax.tree.map(lambda x: x[order], pieces)
+    pieces, second = rimmed(pieces, half, curvature, center, toward)
+    return whole._replace(pieces=pieces, half=half, curvature=curvature, rim=second)
+
+
+def rings_of(iris: Iris) -> Float[Array, " ring"] | None:
+    """How much brighter each ring is than the next one outwards, the last one than nothing.
+
+    Ring k of K lies between the outline times `sqrt((k - 1) / K)` and times `sqrt(k / K)`, and
+    has the mean light of the profile there. None for even light.
+    """
+    if iris.profile is None:
+        return None
+    step = 2 * iris.profile / iris.rings
+    inner = jnp.broadcast_to(step, (iris.rings - 1,))
+    return jnp.append(inner, 1 - step * (iris.rings - 1) / 2)
+
+
+def moved(outline: Outline, move: Callable[[Array], Array]) -> Outline:
+    """The outline, `move` applied to all that it has per pixel, of which the last axes are."""
+    if outline.rim is None or outline.pieces is None:
+        return outline
+    start, end, *rest = outline.pieces
+    pieces = Pieces(move(start), move(end), *rest)
+    return outline._replace(pieces=pieces, rim=jax.tree.map(move, outline.rim))
+
+
+def areas(outline: Outline) -> Float[Array, "height width"]:
+    """The area of what the rim leaves of the opening where the disc's radius is 1."""
+    assert outline.rim is not None
+    high = jnp.full_like(outline.rim.center[0], 2)
+    return outline.squeeze * _area_and_moment(outline, -high, high)[0]
+
+
+class Cut(NamedTuple):
+    """A row of pixels through sprites or, if they have rings, through what a ring bounds.
+
+    - `row`: from a sprite's centre. `scale`, `weight`: of the ring's outline over the sprite's,
+      and its share in `Outline.rings`; None without rings.
+    """
+
+    row: Num[Array, "*cut"]
+    scale: Float[Array, "*cut"] | None
+    weight: Float[Array, "*cut"] | None
+
+
+def cuts(outline: Outline, reach: int) -> Cut:
+    """All rows, ring by ring, of sprites that reach so many pixels; along the first axis."""
+    if outline.rings is None:
+        return Cut(jnp.arange(-reach, reach + 1), None, None)
+    count = len(outline.rings)
+    scales = np.sqrt(np.arange(1, count + 1) / count)  # As `ring_scales`.
+    far = [math.ceil(scale * (reach + 0.5) - 0.5) for scale in scales]
+    rows = np.concatenate([np.arange(-n, n + 1) for n in far])
+    ring = np.repeat(np.arange(count), [2 * n + 1 for n in far])
+    weight = outline.rings[ring]
+    return Cut(jnp.asarray(rows), jnp.asarray(scales[ring], weight.dtype), weight)
+
+
+def span(
+    outline: Outline,
+    radius: Float[Array, "*shape"],
+    side: Float[Array, "*shape"],
+    cut: Cut,
+) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """`chord` of one of the `cuts`."""
+    return chord(outline, radius if cut.scale is None else cut.scale * radius, side, cut.row)
+
+
+def _uncut(iris: Iris, dtype: Any) -> Outline:
+    """The outline as one on the axis sees it."""
     squeeze, sides, curvature = iris._valid_squeeze(), iris.blades, iris.roundness
     if sides == 0:
         return Outline(None, 1.0, None, squeeze)
@@ -242,14 +456,25 @@ def chord(
         return jnp.zeros_like(radius), outline.squeeze * row_half_width(radius, row)
     place = side * jnp.asarray(row, radius.dtype)
     low, high = (place - 0.5) / radius, (place + 0.5) / radius
-    part = jax.vmap(lambda piece: _strip(outline, piece, low, high))
-    area, moment = (jnp.sum(x, axis=0) for x in part(outline.pieces))
+    area, moment = _area_and_moment(outline, low, high)
     # Of a strip that is nothing beside the shape, the mean would be rounding.
     is_there = area > 16 * jnp.finfo(radius.dtype).eps
     area = jnp.where(is_there, area, 0)
     mean = jnp.where(is_there, moment / jnp.where(is_there, area, 1), 0)
     squeeze = outline.squeeze
     return side * radius * squeeze * mean, radius * radius * squeeze * area / 2
+
+
+def _area_and_moment(
+    outline: Outline, low: Float[Array, "*shape"], high: Float[Array, "*shape"]
+) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """Of the outline between two heights, without its squeeze; the moment is along x."""
+    part = jax.vmap(lambda piece: _strip(outline, piece, low, high))
+    area, moment = (jnp.sum(x, axis=0) for x in part(outline.pieces))
+    if outline.rim is None:
+        return area, moment
+    area_of_arcs, moment_of_arcs = arcs_in_strip(outline.rim, low, high)
+    return area + area_of_arcs, moment + moment_of_arcs
 
 
 def _strip(
@@ -296,7 +521,7 @@ def _crossing(
     curvature: Float[Array, ""],
     half: float,
     piece: Pieces,
-    upward: Bool[Array, ""],
+    upward: Bool[Array, "*#shape"],
     height: Float[Array, "*shape"],
 ) -> Float[Array, "*shape"]:
     """x of a piece at a height between those of its ends.

@@ -21,7 +21,7 @@ from jaxfx._meshes import on_any_mesh
 from jaxfx._xla import sum_planes
 from jaxfx.dof.arguments import OWN, Defocused, check_arguments, defocused, with_own
 from jaxfx.dof.behind import Behind, Layer, Surface, checked, given, let_through
-from jaxfx.dof.iris import Iris, check_iris, outline
+from jaxfx.dof.iris import Iris, areas, check_iris, moved, outline
 from jaxfx.dof.kernels import _layer_chords
 from jaxfx.dof.kernels._layers import composited
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets
@@ -187,7 +187,11 @@ def _layered(first, extent, behind, threshold, iris, margin):
     max_coc = extent.max_coc
     view, alpha = _seen_alone(first, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
-    area = math.pi if iris is None else iris.area().astype(view.image.dtype)
+    shape, area = None, math.pi
+    if iris is not None:
+        dtype = view.image.dtype
+        shape = outline(iris, dtype, view.defocus.shape)
+        area = iris.area().astype(dtype) if shape.rim is None else areas(shape)
     opaque = jnp.ones_like(view.defocus) if alpha is None else _painted(alpha)
     through = jnp.where(view.missing, 0, opaque)
     layers = [_sheet(view.image, view.defocus, through, view.missing, threshold, area, alpha)]
@@ -211,11 +215,10 @@ def _layered(first, extent, behind, threshold, iris, margin):
         surfaces.append(Surface(farther, is_there, alpha_behind))
     framed = lambda x: _framed(x, extent.reach - margin)
     sheets = jax.tree.map(lambda *planes: jnp.stack([framed(x) for x in planes]), *layers)
-    if iris is None:
+    if shape is None:
         sums = composited(extent, sheets)
     else:
-        shape = outline(iris, view.image.dtype)
-        sums = _layer_chords.composited(extent, sheets, shape)
+        sums = _layer_chords.composited(extent, sheets, moved(shape, framed))
     light, late = jnp.split(jnp.moveaxis(sums, 0, -1), 2, axis=-1)
     inside = lambda x: _inside(x, margin)
     own = inside(view.image)
@@ -267,12 +270,13 @@ def _sheet(
     through: Float[Array, "height width"],
     missing: Bool[Array, "height width"],
     threshold: Float[Array, ""],
-    area: Float[Array, ""] | float,
+    area: Float[Array, "*size"] | float,
     alpha: Float[Array, "height width"] | None,
 ) -> Sheets:
     """The sprites of one layer, as `Sheets` without the axis of sheets.
 
-    `area` is that of a sprite of radius 1. Of a neighbour that is clear no slope is taken.
+    `area` is that of a sprite of radius 1, of all or of each. Of a neighbour that is clear no
+    slope is taken.
     """
     half = jnp.abs(defocus) / 2
     radius = jnp.where(half < POINT_RADIUS, POINT_RADIUS, half)

@@ -14,7 +14,7 @@ from jaxfx._checks import Number, check, is_concrete, option, parameter
 from jaxfx._meshes import on_any_mesh
 from jaxfx._platform import either
 from jaxfx.dof.arguments import check_arguments, largest_of, pixels, with_own
-from jaxfx.dof.iris import Iris, check_iris, outline
+from jaxfx.dof.iris import Iris, areas, check_iris, outline
 from jaxfx.dof.kernels._adjoint import with_adjoint
 from jaxfx.dof.kernels._chords import Shaped, near_reach, painted, taps
 from jaxfx.dof.kernels._rows import ROWS
@@ -165,11 +165,11 @@ def to_sprites(
     epsilon: Float[Array, ""],
     max_coc: int | float,
     missing: Bool[Array, "height width"],
-    area: Float[Array, ""] | float = math.pi,
+    area: Float[Array, "*size"] | float = math.pi,
 ) -> Sprites:
     """The sprites of an image, in its type; none where the depth is missing.
 
-    `area` is that of a sprite of radius 1.
+    `area` is that of a sprite of radius 1, of all or of each.
     """
     dtype = image.dtype
     coc = lens.circle_of_confusion(depth)
@@ -303,9 +303,11 @@ def _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near):
     dtype = seen.image.dtype
     rematerialised = jax.checkpoint(to_sprites, static_argnums=5)
     operands = seen.image, seen.depth, lens, gamma, epsilon, max_coc, seen.missing
-    sprites = rematerialised(*operands, iris.area().astype(dtype))
+    shape = outline(iris, dtype, seen.depth.shape)
+    area = iris.area().astype(dtype) if shape.rim is None else areas(shape)
+    sprites = rematerialised(*operands, area)
     side = jnp.where(lens.defocus(seen.depth) < 0, -1, 1).astype(dtype)
-    shaped = Shaped(sprites, side, outline(iris, dtype))
+    shaped = Shaped(sprites, side, shape)
     far = reach(max_coc)
     sums = taps(shaped, far) if near is None else painted(shaped, far, near)
     result = _quotient(with_own(sums, seen.image, seen.missing))

@@ -228,7 +228,7 @@ def test_scatter_shows_the_shape_that_many_pinholes_show(depth):
 @pytest.mark.parametrize("name", SHAPES)
 def test_points_of_the_lens_fill_the_shape(name):
     iris = SHAPES[name]
-    points = 2 * np.asarray(iris_samples(iris, 4096)[0])
+    points = np.asarray(iris_samples(check_iris("iris", iris), 4096)[0].squeezed)
     corners = polygon(iris, 200)
     ahead = np.roll(corners, -1, axis=0) - corners
     away = points[:, None] - corners

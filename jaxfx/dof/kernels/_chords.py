@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float
 
 from jaxfx._numerics import clip01
-from jaxfx.dof.iris import Outline, chord
+from jaxfx.dof.iris import Cut, Outline, cuts, moved, span
 from jaxfx.dof.kernels._span_painter import filled
 from jaxfx.dof.kernels._taps import UNCOUPLED
 from jaxfx.dof.sprites import Sprites, leak_rejection, reach
@@ -37,10 +37,10 @@ def _ends(
     outline: Outline,
     radius: Float[Array, "*shape"],
     side: Float[Array, "*shape"],
-    row: Num[Array, ""],
+    cut: Cut,
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Where the span of each sprite begins and ends in a row, from its centre, in pixels."""
-    center, half_width = chord(outline, radius, side, row)
+    center, half_width = span(outline, radius, side, cut)
     return center - half_width, center + half_width
 
 
@@ -56,16 +56,22 @@ def taps(shaped: Shaped, reach: int) -> Float[Array, "height width value"]:
 
     # Nothing lies beyond the frame: a point there has no value.
     value, radius, leak, side = pad(value, 0), pad(radius, 1), pad(leak, -1), pad(side, 1)
+    margins = (reach, reach), (reach, reach)
+    outline = moved(outline, lambda x: jnp.pad(x, [*[(0, 0)] * (x.ndim - 2), *margins]))
 
-    def row_of(x, row):
-        return jax.lax.dynamic_slice_in_dim(x, reach - row, height, axis=0)
+    def row_of(x, row, axis=0):
+        return jax.lax.dynamic_slice_in_dim(x, reach - row, height, axis=axis)
 
     def column_of(x, column):
         return jax.lax.dynamic_slice_in_dim(x, reach - column, width, axis=1)
 
-    def add_row(sums, row):
-        start, end = _ends(outline, row_of(radius, row), row_of(side, row), row)
+    def add_row(sums, cut):
+        row = cut.row
+        here = moved(outline, lambda x: row_of(x, row, axis=x.ndim - 2))
+        start, end = _ends(here, row_of(radius, row), row_of(side, row), cut)
         row_value, row_leak = row_of(value, row), row_of(leak, row)
+        if cut.weight is not None:
+            row_value = cut.weight * row_value
 
         def add_tap(sums, column):
             edge = 0.5 - column.astype(start.dtype)
@@ -77,7 +83,7 @@ def taps(shaped: Shaped, reach: int) -> Float[Array, "height width value"]:
         return jax.lax.scan(jax.checkpoint(add_tap), sums, offsets)
 
     sums = jnp.zeros((height, width, value.shape[-1]), value.dtype)
-    return jax.lax.scan(jax.checkpoint(add_row), sums, offsets)[0]
+    return jax.lax.scan(jax.checkpoint(add_row), sums, cuts(outline, reach))[0]
 
 
 def painted(shaped: Shaped, far: int, near: int) -> Float[Array, "height width value"]:
@@ -110,18 +116,19 @@ def _paint(value, radius, side, layer, outline, far):
     x = jnp.arange(width, dtype=radius.dtype)[None] + (far + 1.5)
     flat = value.reshape(-1, values)
 
-    def add_row(steps, row):
-        start, end = _ends(outline, radius, side, row)
+    def add_row(steps, cut):
+        start, end = _ends(outline, radius, side, cut)
+        light = flat if cut.weight is None else cut.weight * flat
         for edge, sign in ((start, 1), (end, -1)):
             place = x + edge
             cell = jnp.floor(place)
-            cut = (place - cell).reshape(-1, 1)
-            at = ((y + row) * columns + cell.astype(int)).reshape(-1)
-            step = sign * jnp.concatenate([flat, cut * flat], axis=1)
+            part = (place - cell).reshape(-1, 1)
+            at = ((y + cut.row) * columns + cell.astype(int)).reshape(-1)
+            step = sign * jnp.concatenate([light, part * light], axis=1)
             steps = steps.at[at].add(step, mode="clip")
         return steps, None
 
     steps = jnp.zeros((2 * rows * columns, 2 * values), value.dtype)
-    steps = jax.lax.scan(jax.checkpoint(add_row), steps, jnp.arange(-far, far + 1))[0]
+    steps = jax.lax.scan(jax.checkpoint(add_row), steps, cuts(outline, far))[0]
     sums = filled(steps.reshape(2, rows, columns, 2 * values), axis=2)
     return sums[:, far:, far + 1 :][:, :height, :width]

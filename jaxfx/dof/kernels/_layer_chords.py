@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfx.dof.iris import Outline, chord
+from jaxfx.dof.iris import Outline, cuts, span
 from jaxfx.dof.kernels._compositing import allowance
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets, share_of
 from jaxfx.dof.kernels._span_painter import filled
@@ -77,12 +77,15 @@ def _arriving(
     parts = [(number, share_of(place - whole)), (number + 1, share_of(place - whole - 1))]
     cells = (_GROUP, height, width + 1)
 
-    def add_row(steps, row):
-        center, half = chord(outline, radius, side, row)
+    def add_row(steps, at_row):
+        row = at_row.row
+        center, half = span(outline, radius, side, at_row)
         facing = 1 + tilt_y * row.astype(place.dtype) + tilt_x * center
         center = center + tilt_x * half * half / 3
         there = (y + row >= 0) & (y + row < height)
         light = (facing[None] * value).reshape(values, -1).T
+        if at_row.weight is not None:
+            light = at_row.weight * light
         for edge, sign in ((center - half, 1), (center + half, -1)):
             # What begins before the frame is there from its first pixel on.
             end = jnp.clip(x + edge, 0, width)
@@ -97,6 +100,6 @@ def _arriving(
         return steps, None
 
     steps = jnp.zeros((_GROUP * height * (width + 1), 2 * values), value.dtype)
-    steps = jax.lax.scan(jax.checkpoint(add_row), steps, jnp.arange(-far, far + 1))[0]
+    steps = jax.lax.scan(jax.checkpoint(add_row), steps, cuts(outline, far))[0]
     sums = filled(steps.reshape(*cells, 2 * values), axis=2)
     return jnp.moveaxis(sums[:, :, :width], -1, 1)
