@@ -31,9 +31,11 @@ from jaxfx.fit._lens_model import Effect
 from jaxfx.fit._stack_planes import (
     WINDOW,
     Planes,
+    around,
     at_inverse_depth,
     best,
     compared,
+    settled,
 )
 from jaxfx.fit._stack_search import StackResidual
 from jaxfx.lens import ThinLens
@@ -114,7 +116,7 @@ def focal_stack(
     max_depth: Number | None = None,
     effect: Effect = "scatter",
     smoothness: Number = 1.0,
-    max_steps: WholeNumber = 24,
+    max_steps: WholeNumber = 8,
     throw: bool = True,
     progress: bool = False,
 ) -> FocalStackFit:
@@ -159,8 +161,9 @@ def focal_stack(
 
     First candidate planes are compared, a third of a pixel of defocus apart. For each the image
     that explains the stack best is a quotient of Fourier transforms, and the plane whose
-    residuals in a window are least gives a pixel its depth. Where that is not determined it is
-    filled as by `depth.fill`. From there image and inverse depth are searched for together, by
+    residuals in a window are least gives a pixel its depth. Then each takes the median about it,
+    weighted by the planes' agreement with the images and by likeness of color; where nothing
+    near is determined it is filled as by `depth.fill`. From there image and inverse depth are searched for together, by
     nonlinear conjugate gradients through the effect, with a pseudo-Huber loss, and a prior of
     the same form on second differences of the inverse depth, which is less at edges of the
     image. The standard error is that of Gauss and Newton, with the image solved for, from
@@ -194,11 +197,13 @@ def focal_stack(
         planes = compared(stack, *lines, candidates, pad)
         bar.step(planes=str(len(candidates)))
         start = best(planes, candidates)
-        error = _errors(planes, candidates, start)
         # An image that fits is seen through planes that fit, told or not.
         image = at_inverse_depth(planes.image, candidates, start)
         energy = at_inverse_depth(planes.energy, candidates, start)
-        start = _filled(start, error, stack)
+        tiny = jnp.finfo(dtype).tiny
+        guide = image / jnp.maximum(jnp.sqrt(jnp.mean(image * image)), tiny)
+        start = settled(start, 1 / jnp.maximum(energy, tiny), guide)
+        start = _filled(start, _errors(planes, candidates, start), stack)
         residual = _residual(
             stack, lenses, image, energy, candidates, start, smoothness, effect
         )
@@ -315,8 +320,8 @@ def _errors(planes: Planes, candidates: Array, inverse_depth: Array) -> Array:
 
 
 def _filled(inverse_depth: Array, error: Array, stack: Array) -> Array:
-    """The inverse depth, undetermined pixels filled from others, if there are any."""
-    is_known = error < _MOST_ERROR * inverse_depth
+    """The inverse depth, filled where no pixel within the median's reach is determined."""
+    is_known = around(error < _MOST_ERROR * inverse_depth)
     if not bool(is_known.any()):
         return inverse_depth
     guide = jnp.mean(stack, axis=0)
