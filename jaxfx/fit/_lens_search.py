@@ -15,7 +15,7 @@ from jaxfx._checks import is_concrete
 from jaxfx.dof.arguments import largest_coc
 from jaxfx.fit._descent import End
 from jaxfx.fit._in_program import each, stacked
-from jaxfx.fit._lens_model import LENS, Model, Values
+from jaxfx.fit._lens_model import FULL_FOOTPRINT, LENS, Model, Values
 from jaxfx.fit._lens_noise import weighed
 from jaxfx.fit._lens_residual import Residual, evaluate, mean_size
 
@@ -69,7 +69,7 @@ class Search(NamedTuple):
         """The last residual, where it ended, and the parameters where small images ended.
 
         Small images, plain squares: compare lenses, search from the best. The same images,
-        edges with a noise of their own: refine the best end. Then the images as given.
+        edges with a noise of their own: refine the best end, twice. Then the images as given.
         """
         shrink = _shrink(model, self.max_coc)
         images = model.images if shrink == 1 else model.images.shrunk(shrink)
@@ -87,8 +87,9 @@ class Search(NamedTuple):
         losses += [loss for end in ends for loss in end.losses]
         ends = _ranked(residual, ends)
         if self.is_robust:
-            ends[0] = self._refine(residual, ends[0].unknowns, has_edges=True)
-            losses += ends[0].losses
+            refined = self._beside_edges(residual, ends[0].unknowns)
+            losses += [loss for end in refined for loss in end.losses]
+            ends[0] = refined[0]
         full = small if shrink == 1 else model
         residual, end, more = self._finish(full, ends[0].unknowns)
         reported = tuple(
@@ -105,6 +106,25 @@ class Search(NamedTuple):
         if self.is_robust:
             residual = weighed(residual, unknowns, has_edges)
         return self.solve(residual, unknowns, **_SOON)
+
+    def _beside_edges(self, residual: Residual, unknowns: Values) -> list[End]:
+        """Two searches in which edges have a noise of their own, the better one first.
+
+        One has the sprites' own footprint, the other starts at that of a photograph. Far from
+        edges small circles may be all there is: with the wrong footprint they are explained by
+        a smaller aperture and a focus beyond all that is seen.
+        """
+        model = residual.model
+        if "footprint" not in model.names:
+            return [self._refine(residual, unknowns, has_edges=True)]
+        with_footprint = lambda corrects: dataclasses.replace(
+            residual, model=dataclasses.replace(model, corrects=corrects)
+        )
+        full = jnp.full_like(unknowns["footprint"], FULL_FOOTPRINT)
+        none, one = jnp.zeros_like(model.corrects), jnp.ones_like(model.corrects)
+        starts = [(none, unknowns), (one, unknowns | {"footprint": full})]
+        search = lambda start: self._refine(with_footprint(start[0]), start[1], has_edges=True)
+        return _ranked(with_footprint(one), each(search, starts, residual))
 
     def _finish(self, model: Model, unknowns: Values) -> tuple[Residual, End, list[Array]]:
         """The last searches, on the images as given: residual, end, and the losses of all."""
