@@ -55,8 +55,7 @@ def main():
     print(
         f"{given.effect}: {len(error)} of {given.count} rooms are no failure. Off by "
         f"{shown(np.median(error, axis=0))} % in the median (aperture and focus distance), "
-        f"{shown(error.max(axis=0))} % at worst; stated {shown(np.median(stated, axis=0))} % in "
-        f"the median; "
+        f"{shown(error.max(axis=0))} % at worst; stated {shown(np.median(stated, axis=0))} %; "
         f"within 1.96 stated errors {shown(np.mean(error < 1.96 * stated, axis=0))} %."
     )
 
