@@ -45,6 +45,10 @@ _COARSE, _LEAST_COC = 160, 5.0
 # time, smaller ones more rounds.
 _TRIED_MARGIN, _MARGIN, _ROUNDS = 2.0, 1.25, 4
 
+# The factor by which a search with a free footprint must differ less than one without, which
+# has an unknown less. With 1, noise decides where an effect made the image itself.
+_HANDICAP = 1.01
+
 # When a search whose end is another's start has converged: see `descend`.
 _SOON = {"patience": 2, "gain": 1e-3}
 
@@ -124,7 +128,8 @@ class Search(NamedTuple):
         none, one = jnp.zeros_like(model.corrects), jnp.ones_like(model.corrects)
         starts = [(none, unknowns), (one, unknowns | {"footprint": full})]
         search = lambda start: self._refine(with_footprint(start[0]), start[1], has_edges=True)
-        return _ranked(with_footprint(one), each(search, starts, residual))
+        ends = each(search, starts, residual)
+        return _ranked(with_footprint(one), ends, jnp.asarray([1.0, _HANDICAP]))
 
     def _finish(self, model: Model, unknowns: Values) -> tuple[Residual, End, list[Array]]:
         """The last searches, on the images as given: residual, end, and the losses of all."""
@@ -219,10 +224,15 @@ def _lowest(losses: Float[Array, "..."]) -> Int[Array, " search"]:
     return places[jnp.minimum(jnp.arange(_SEARCHES), count - 1)]
 
 
-def _ranked(residual: Residual, ends: list[End]) -> list[End]:
-    """The ends, those first whose images differ least, by the mean absolute difference."""
+def _ranked(
+    residual: Residual, ends: list[End], handicaps: Float[Array, " end"] | float = 1.0
+) -> list[End]:
+    """The ends, those first whose images differ least, by the mean absolute difference.
+
+    That of each is multiplied by its handicap.
+    """
     size = lambda unknowns: jnp.sum(mean_size(residual, unknowns))
-    sizes = jnp.stack(each(size, [end.unknowns for end in ends], residual))
+    sizes = handicaps * jnp.stack(each(size, [end.unknowns for end in ends], residual))
     order = jnp.argsort(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf), stable=True)
     if is_concrete(order):
         return [ends[at] for at in order.tolist()]
