@@ -129,7 +129,7 @@ class Search(NamedTuple):
         starts = [(none, unknowns), (one, unknowns | {"footprint": full})]
         search = lambda start: self._refine(with_footprint(start[0]), start[1], has_edges=True)
         ends = each(search, starts, residual)
-        return _ranked(with_footprint(one), ends, jnp.asarray([1.0, _HANDICAP]))
+        return _ranked(with_footprint(one), ends, (1.0, _HANDICAP))
 
     def _finish(self, model: Model, unknowns: Values) -> tuple[Residual, End, list[Array]]:
         """The last searches, on the images as given: residual, end, and the losses of all."""
@@ -225,14 +225,16 @@ def _lowest(losses: Float[Array, "..."]) -> Int[Array, " search"]:
 
 
 def _ranked(
-    residual: Residual, ends: list[End], handicaps: Float[Array, " end"] | float = 1.0
+    residual: Residual, ends: list[End], handicaps: tuple[float, ...] | None = None
 ) -> list[End]:
     """The ends, those first whose images differ least, by the mean absolute difference.
 
     That of each is multiplied by its handicap.
     """
     size = lambda unknowns: jnp.sum(mean_size(residual, unknowns))
-    sizes = handicaps * jnp.stack(each(size, [end.unknowns for end in ends], residual))
+    sizes = jnp.stack(each(size, [end.unknowns for end in ends], residual))
+    if handicaps:
+        sizes = sizes * jnp.asarray(handicaps, sizes.dtype)
     order = jnp.argsort(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf), stable=True)
     if is_concrete(order):
         return [ends[at] for at in order.tolist()]
