@@ -1,13 +1,17 @@
 """Errors, stated errors and seconds of `fit.dof`, for `docs/fits.md`.
 
-`python -m benchmarks.fit_lens [MESH ...]` fits multi-pass images of 320 x 240 pixels of the
-still life and of every mesh that is given, at three foci and two apertures, from starts that
-are 30 % (aperture) and 15 % (focus) off, in both directions. A row holds the medians of a
-method, the worst in brackets; `--each` prints every fit.
+`python -m benchmarks.fit_lens ["still life"] [MESH ...]` fits multi-pass images of 320 x 240
+pixels of the still life or of the meshes that are given, at three foci and two apertures, from
+starts that are 30 % (aperture) and 15 % (focus) off, in both directions. A row of the table
+holds the medians of a method, the worst in brackets; `--each` prints every fit. With `--save
+FILE` fits are written as they come, and those in the file are not made again. `--seconds` makes
+every fit twice and times the second, which compiles nothing.
 """
 
 import argparse
 import itertools
+import json
+import pathlib
 import time
 
 import jax
@@ -18,79 +22,119 @@ from jaxfx import ThinLens, fit, scene
 
 
 SIZE = (240, 320)
-STARTS = (1.3, 1.15), (0.7, 0.85)
+STARTS = {"large": (1.3, 1.15), "small": (0.7, 0.85)}
 FREE = ("aperture", "focus_distance")
 METHODS = {
     "scatter": {"parameters": FREE, "gamma": 0.0},
     "layered": {"effect": "layered", "parameters": FREE},
+    "layered, guessed layer": {"effect": "layered", "parameters": FREE, "behind": "peel"},
     "layered, second layer": {"effect": "layered", "parameters": FREE},
     "scatter, squares": {"parameters": FREE, "gamma": 0.0, "loss": "squares"},
 }
+KEYS = ("scene", "focus", "largest", "method", "start")
+STILL_LIFE = "still life"
 
 
-def fits(case, name, options):
-    """For every focus, aperture and start: name, errors, stated errors (ratios), seconds."""
-    if name.endswith("second layer"):
+def fitted(case, reference, lens, method, start, again):
+    """One fit as a record: errors and stated errors as ratios to the truth."""
+    options = METHODS[method]
+    if method.endswith("second layer"):
         options = options | {"behind": case.behind}
-    for (place, share), largest in itertools.product(FOCI.items(), LARGEST):
-        lens, reference = case.focused(share, largest)
-        for aperture, focus in STARTS:
-            start = ThinLens(
-                lens.aperture * aperture, lens.focus_distance * focus, lens.focal_pixels
-            )
-            begin = time.perf_counter()
-            data = reference, case.image, case.depth, start
-            fitted = jax.block_until_ready(fit.dof(*data, throw=False, **options))
-            took = time.perf_counter() - begin
-            truth = np.array([float(getattr(lens, name)) for name in FREE])
-            error = np.array([float(getattr(fitted.lens, name)) for name in FREE]) / truth - 1
-            stated = np.array([float(fitted.standard_errors[name]) for name in FREE]) / truth
-            yield f"{place}, {largest} pixels", error, stated, took, fitted.success
+    aperture, focus = STARTS[start]
+    begins = ThinLens(lens.aperture * aperture, lens.focus_distance * focus, lens.focal_pixels)
+    data = reference, case.image, case.depth, begins
+    if again:
+        jax.block_until_ready(fit.dof(*data, throw=False, **options))
+    begin = time.perf_counter()
+    found = jax.block_until_ready(fit.dof(*data, throw=False, **options))
+    took = time.perf_counter() - begin
+    truth = {name: float(getattr(lens, name)) for name in FREE}
+    return {
+        "error": [float(getattr(found.lens, name)) / truth[name] - 1 for name in FREE],
+        "stated": [float(found.standard_errors[name]) / truth[name] for name in FREE],
+        "footprint": float(found.footprint),
+        "explained": float(found.explained),
+        "doubt": found.doubt,
+        "seconds": took,
+    }
+
+
+def fits(given, known):
+    """The records of all fits that are asked for, those that are known first."""
+    wanted = list(itertools.product(given.methods, given.starts))
+    for path in given.meshes:
+        title, case = STILL_LIFE if path == STILL_LIFE else pathlib.Path(path).stem, None
+        for focus, largest in itertools.product(given.foci, given.largest):
+            place = title, focus, largest
+            yield from (known[place + how] for how in wanted if place + how in known)
+            missing = [how for how in wanted if place + how not in known]
+            if not missing:
+                continue
+            if case is None:
+                mesh = scene.still_life() if path == STILL_LIFE else scene.load(path)
+                case = Case(mesh, SIZE, given.samples)
+            lens, reference = case.focused(FOCI[focus], largest)
+            for method, start in missing:
+                row = fitted(case, reference, lens, method, start, given.seconds)
+                row = dict(zip(KEYS, (*place, method, start), strict=True)) | row
+                if given.each:
+                    print(row, flush=True)
+                if given.save:
+                    with given.save.open("a") as file:
+                        print(json.dumps(row), file=file)
+                yield row
+
+
+def table(rows, methods, has_seconds):
+    """The lines of a table in Markdown, one row for each method."""
+    yield (
+        "| method | error of aperture, % | error of focus, % | stated, % | within 1.96 | fits |"
+        " success |" + has_seconds * " s |"
+    )
+    yield "|---|---:|---:|---:|---:|---:|---:|" + has_seconds * "---:|"
+    for method in methods:
+        own = [row for row in rows if row["method"] == method]
+        if not own:
+            continue
+        column = lambda name, own=own: np.array([row[name] for row in own])
+        size, stated = 100 * np.abs(column("error")), 100 * column("stated")
+        shown = [f"{np.median(size[:, i]):.1f} ({size[:, i].max():.1f})" for i in range(2)]
+        held = 100 * (size < 1.96 * stated).mean(axis=0)
+        line = (
+            f"| {method} | {shown[0]} | {shown[1]} | {np.median(stated[:, 0]):.1f}, "
+            f"{np.median(stated[:, 1]):.1f} | {held[0]:.0f} %, {held[1]:.0f} % | {len(own)} | "
+            f"{np.sum(column('doubt') == '')} |"
+        )
+        took = column("seconds")
+        yield line + has_seconds * f" {np.median(took):.1f} ({took.max():.1f}) |"
 
 
 def main():
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("meshes", nargs="*", metavar="MESH", help="files that trimesh reads")
+    parser.add_argument(
+        "meshes",
+        nargs="*",
+        default=[STILL_LIFE],
+        metavar="MESH",
+        help="files that trimesh reads, or 'still life'",
+    )
     parser.add_argument("--samples", type=int, default=256, help="passes of a reference")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=[*METHODS])
+    parser.add_argument("--foci", nargs="*", choices=FOCI, default=[*FOCI])
+    parser.add_argument("--largest", nargs="*", type=int, default=[*LARGEST], help="pixels")
+    parser.add_argument("--starts", nargs="*", choices=STARTS, default=[*STARTS])
     parser.add_argument("--each", action="store_true", help="print every fit")
-    given = parser.parse_args()
-    paths = [None, *given.meshes]
-    meshes = [scene.still_life() if path is None else scene.load(path) for path in paths]
-    cases = [Case(mesh, SIZE, given.samples) for mesh in meshes]
-    print(
-        "| method | error of aperture, % | error of focus, % | stated, % | within 1.96 | s "
-        "| success |"
+    parser.add_argument(
+        "--save", type=pathlib.Path, metavar="FILE", help="of fits, as they come"
     )
-    print("|---|---:|---:|---:|---:|---:|---:|")
-    for name in given.methods:
-        rows = []
-        for path, case in zip(paths, cases, strict=True):
-            for place, *row in fits(case, name, METHODS[name]):
-                rows.append(row)
-                if given.each:
-                    error, stated, took, success = row
-                    print(
-                        name,
-                        path or "still life",
-                        place,
-                        100 * error,
-                        100 * stated,
-                        took,
-                        success,
-                        flush=True,
-                    )
-        error, stated, took, success = (np.array(column) for column in zip(*rows, strict=True))
-        size = 100 * np.abs(error)
-        shown = [f"{np.median(size[:, i]):.1f} ({size[:, i].max():.1f})" for i in range(2)]
-        errors = ", ".join(f"{100 * np.median(stated[:, i]):.1f}" for i in range(2))
-        held = (np.abs(error) < 1.96 * stated).mean(axis=0)
-        print(
-            f"| {name} | {shown[0]} | {shown[1]} | {errors} | "
-            f"{100 * held[0]:.0f} %, {100 * held[1]:.0f} % | "
-            f"{np.median(took):.1f} ({np.max(took):.1f}) | {success.sum()} of {len(rows)} |",
-            flush=True,
-        )
+    parser.add_argument("--seconds", action="store_true", help="make every fit twice")
+    given = parser.parse_args()
+    known = {}
+    if given.save and given.save.exists():
+        rows = map(json.loads, given.save.read_text().splitlines())
+        known = {tuple(row[key] for key in KEYS): row for row in rows}
+    rows = list(fits(given, known))
+    print(*table(rows, given.methods, given.seconds), sep="\n")
 
 
 if __name__ == "__main__":

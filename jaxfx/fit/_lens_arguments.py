@@ -101,6 +101,11 @@ def without_saturated(images: Images) -> Images:
     return images._replace(weights=jnp.where(is_saturated, 0, images.weights))
 
 
+def peels(behind: Any) -> bool:
+    """Whether the second layer is guessed: `"peel"`, the only word that it may be."""
+    return isinstance(behind, str) and bool(option("dof(behind=...)", behind, ("peel",)))
+
+
 def _behind(behind: Any, image: Array) -> tuple[Array, Array]:
     """The second layer's image, in the type of the first's, and its depth."""
     name, expected = "dof(behind=...)", "a pair of an image and its depth"

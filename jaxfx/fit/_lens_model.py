@@ -41,6 +41,9 @@ _SMALLEST = 1e-6
 # differences in, a larger one costs and corrects next to nothing.
 _SMALL_COC = 8.0
 
+# The unknown of a footprint of 1, that of a photograph.
+FULL_FOOTPRINT = 2 * math.atanh(0.5)
+
 
 class Images(NamedTuple):
     """The images of a fit, all of one size and type.
@@ -82,6 +85,7 @@ class Model(eqx.Module):
     - `iris`: the shape of the lens, whose numbers are those of the values; None for the disc.
     - `names`: the parameters that are sought.
     - `max_coc`: the largest circle of confusion that is drawn, in pixels.
+    - `peels`: whether the second layer is guessed, anew for each lens.
     """
 
     images: Images
@@ -91,6 +95,7 @@ class Model(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     effect: Effect = eqx.field(static=True)
     max_coc: int | float = eqx.field(static=True)
+    peels: bool = eqx.field(static=True, default=False)
 
     def values(self, unknowns: Values) -> Values:
         """All parameters, in their units, from unknowns, which are 0 at the start.
@@ -188,7 +193,7 @@ class Model(eqx.Module):
                     image,
                     depth,
                     lens,
-                    behind=behind,
+                    behind="peel" if self.peels else behind,
                     threshold=values["threshold"],
                     max_coc=self.max_coc,
                     iris=iris,

@@ -15,7 +15,7 @@ from jaxfx._checks import is_concrete
 from jaxfx.dof.arguments import largest_coc
 from jaxfx.fit._descent import End
 from jaxfx.fit._in_program import each, stacked
-from jaxfx.fit._lens_model import LENS, Model, Values
+from jaxfx.fit._lens_model import FULL_FOOTPRINT, LENS, Model, Values
 from jaxfx.fit._lens_noise import weighed
 from jaxfx.fit._lens_residual import Residual, evaluate, mean_size
 
@@ -45,6 +45,10 @@ _COARSE, _LEAST_COC = 160, 5.0
 # time, smaller ones more rounds.
 _TRIED_MARGIN, _MARGIN, _ROUNDS = 2.0, 1.25, 4
 
+# The factor by which a search with a free footprint must differ less than one without, which
+# has an unknown less. With 1, noise decides where an effect made the image itself.
+_HANDICAP = 1.01
+
 # When a search whose end is another's start has converged: see `descend`.
 _SOON = {"patience": 2, "gain": 1e-3}
 
@@ -69,7 +73,7 @@ class Search(NamedTuple):
         """The last residual, where it ended, and the parameters where small images ended.
 
         Small images, plain squares: compare lenses, search from the best. The same images,
-        edges with a noise of their own: refine the best end. Then the images as given.
+        edges with a noise of their own: refine the best end, twice. Then the images as given.
         """
         shrink = _shrink(model, self.max_coc)
         images = model.images if shrink == 1 else model.images.shrunk(shrink)
@@ -87,8 +91,9 @@ class Search(NamedTuple):
         losses += [loss for end in ends for loss in end.losses]
         ends = _ranked(residual, ends)
         if self.is_robust:
-            ends[0] = self._refine(residual, ends[0].unknowns, has_edges=True)
-            losses += ends[0].losses
+            refined = self._beside_edges(residual, ends[0].unknowns)
+            losses += [loss for end in refined for loss in end.losses]
+            ends[0] = refined[0]
         full = small if shrink == 1 else model
         residual, end, more = self._finish(full, ends[0].unknowns)
         reported = tuple(
@@ -105,6 +110,26 @@ class Search(NamedTuple):
         if self.is_robust:
             residual = weighed(residual, unknowns, has_edges)
         return self.solve(residual, unknowns, **_SOON)
+
+    def _beside_edges(self, residual: Residual, unknowns: Values) -> list[End]:
+        """Two searches in which edges have a noise of their own, the better one first.
+
+        One has the sprites' own footprint, the other starts at that of a photograph. Far from
+        edges small circles may be all there is: with the wrong footprint they are explained by
+        a smaller aperture and a focus beyond all that is seen.
+        """
+        model = residual.model
+        if "footprint" not in model.names:
+            return [self._refine(residual, unknowns, has_edges=True)]
+        with_footprint = lambda corrects: dataclasses.replace(
+            residual, model=dataclasses.replace(model, corrects=corrects)
+        )
+        full = jnp.full_like(unknowns["footprint"], FULL_FOOTPRINT)
+        none, one = jnp.zeros_like(model.corrects), jnp.ones_like(model.corrects)
+        starts = [(none, unknowns), (one, unknowns | {"footprint": full})]
+        search = lambda start: self._refine(with_footprint(start[0]), start[1], has_edges=True)
+        ends = each(search, starts, residual)
+        return _ranked(with_footprint(one), ends, (1.0, _HANDICAP))
 
     def _finish(self, model: Model, unknowns: Values) -> tuple[Residual, End, list[Array]]:
         """The last searches, on the images as given: residual, end, and the losses of all."""
@@ -199,10 +224,17 @@ def _lowest(losses: Float[Array, "..."]) -> Int[Array, " search"]:
     return places[jnp.minimum(jnp.arange(_SEARCHES), count - 1)]
 
 
-def _ranked(residual: Residual, ends: list[End]) -> list[End]:
-    """The ends, those first whose images differ least, by the mean absolute difference."""
+def _ranked(
+    residual: Residual, ends: list[End], handicaps: tuple[float, ...] | None = None
+) -> list[End]:
+    """The ends, those first whose images differ least, by the mean absolute difference.
+
+    That of each is multiplied by its handicap.
+    """
     size = lambda unknowns: jnp.sum(mean_size(residual, unknowns))
     sizes = jnp.stack(each(size, [end.unknowns for end in ends], residual))
+    if handicaps:
+        sizes = sizes * jnp.asarray(handicaps, sizes.dtype)
     order = jnp.argsort(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf), stable=True)
     if is_concrete(order):
         return [ends[at] for at in order.tolist()]

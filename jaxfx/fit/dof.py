@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Collection, Sequence
-from typing import final
+from typing import Literal, final
 
 import equinox as eqx
 import jax
@@ -58,8 +58,8 @@ class DofFit(eqx.Module):
       photograph where it differs between them. From a jackknife: the residuals of 8 x 8 tiles
       of the image are taken for independent of one another, and no others. With
       `loss="robust"` those of lenses, `scale`, `shift` and the iris allow for what an effect
-      draws wrong: circles of confusion that are off by 5 % and a third of a pixel, alike for
-      all pixels of about the same defocus. A parameter that the images do not determine has a
+      draws wrong: circles of confusion that are off by 5 % and 0.28 pixels, alike for all
+      pixels of about the same defocus. A parameter that the images do not determine has a
       large one, or inf.
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
       pixels that count, times the share of those.
@@ -149,6 +149,7 @@ def dof(
     effect: Effect = "scatter",
     threshold: Float[ArrayLike, ""] | float = 2.0,
     behind: tuple[Float[ArrayLike, "height width channel"], Num[ArrayLike, "height width"]]
+    | Literal["peel"]
     | None = None,
     iris: Iris | None = None,
     max_coc: Number | None = None,
@@ -178,8 +179,9 @@ def dof(
       `focal_pixels` is never fitted.
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
-    - `behind`: the second layer, as in `dof.layered`; None fits through a single one. It is
-      not guessed: to draw what was fitted, give `dof.layered` the same `behind`, None too.
+    - `behind`: the second layer of `"layered"`, as there a pair of shapes height width channel
+      and height width. `"peel"` guesses it, for each lens that is tried; None fits through a
+      single layer. To draw what was fitted, give `dof.layered` the same `behind`, None too.
     - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
       may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.
@@ -235,12 +237,16 @@ def dof(
     is saturated: where a channel has its own largest value, with seven others at least. First,
     lenses of half to twice the aperture and 0.7 to 1.4 times the focus distance are compared on
     images of at most 160 pixels a side. From the best two, and from half and twice the epsilon
-    or the threshold, a search goes on there; the best end is refined on the images as given.
+    or the threshold, a search goes on there. The best end is searched from again with no
+    footprint and with that of a photograph, and the better of both is refined on the images as
+    given.
 
     Source: Huber 1964, the loss; Golub & Pereyra 1973, exposure by variable projection. The
     noise near edges, the footprint and the lenses that are compared are our own.
     """
-    images, lenses = read.images(reference, image, depth, lens, behind, weights)
+    peels = read.peels(behind)
+    known = None if peels else behind
+    images, lenses = read.images(reference, image, depth, lens, known, weights)
     read.options(effect=effect, loss=loss, tone=tone, exposure=exposure)
     max_steps = whole_number("dof(max_steps=...)", max_steps)
     iris = None if iris is None else check_iris("dof(iris=...)", iris)
@@ -260,7 +266,7 @@ def dof(
     # The footprint knows what the sprites of discs lack.
     if is_robust and iris is None and {*LENS, *DISPARITY}.intersection(names):
         names = (*names, "footprint")
-    model = Model(images, start, jnp.zeros(()), iris, names, effect, 1.0)
+    model = Model(images, start, jnp.zeros(()), iris, names, effect, 1.0, peels)
     ratios = read.ratios(ratios)
 
     def fitted_to(model: Model, bar: Bar) -> DofFit:

@@ -16,7 +16,7 @@ def test_the_variances_are_those_of_solving_again_with_each_error():
     widening = rng.normal(size=(2, 12, 3))
     circle = np.maximum(abs(defocus), 1).reshape(2, 12, 1)
     expected = np.zeros(4)
-    for error in (0.05 * widening, 0.33 * widening / circle):
+    for error in (0.05 * widening, 0.28 * widening / circle):
         for stratum in np.argsort(defocus.reshape(2, 12)).reshape(2, 6, 2).swapaxes(0, 1):
             wrong = np.zeros_like(error)
             for photograph, pixels in enumerate(stratum):

@@ -108,6 +108,21 @@ def test_the_threshold_of_layered_scatter_is_found():
 
 
 @pytest.mark.full
+def test_a_second_layer_is_guessed_for_each_lens_that_is_tried():
+    """What `layered` draws with a guess is fitted exactly with one, and not without."""
+    image, depth = still_life(24)
+    start, truth = ThinLens(0.14, 2.8, 100.0), ThinLens(0.12, 3.0, 100.0)
+    photograph = dof.layered(image, depth, truth, max_coc=8.0)
+    options = {"effect": "layered", "parameters": ("aperture", "focus_distance")}
+    options |= {"loss": "squares", "max_coc": 8.0, "throw": False}
+    found = fit.dof(photograph, image, depth, start, behind="peel", **options)
+    values = found.lens.aperture, found.lens.focus_distance
+    np.testing.assert_allclose(values, (0.12, 3.0), rtol=1e-6)
+    single = fit.dof(photograph, image, depth, start, **options)
+    assert found.losses[-1] < 1e-6 * single.losses[-1]
+
+
+@pytest.mark.full
 def test_a_lens_that_no_derivative_moves_may_be_held():
     """Circles below a pixel show no lens, but the other parameters can be fitted."""
     image, depth = still_life(16)
@@ -300,6 +315,7 @@ FAULTS = {
         "effect": "layered",
         "behind": (np.zeros((SIZE, SIZE, 1)), np.ones((SIZE, SIZE))),
     },
+    "dof(behind=...) must be one of ('peel',)": {"effect": "layered", "behind": "guess"},
     "dof(max_coc=...) must be positive": {"max_coc": -1},
     "dof(max_coc=...) must be positive and finite": {"max_coc": np.inf},
 }
