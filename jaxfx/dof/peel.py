@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
+from jaxfx._meshes import on_any_mesh
 from jaxfx.dof.arguments import check_arguments, defocused
 from jaxfx.dof.behind import Behind, Layer, checked, given
 from jaxfx.lens import Lens
@@ -22,6 +23,7 @@ _BEYOND = 1.0
 _LAST_ROUNDS = 1
 
 
+@on_any_mesh
 def peel(
     image: Float[ArrayLike, "height width channel"],
     depth: Num[ArrayLike, "height width"],

@@ -7,6 +7,7 @@ import pkgutil
 import pytest
 
 import jaxfx
+from jaxfx import _meshes
 from tests.helpers.fits import FITS
 from tests.test_transforms import CASES, FUNCTIONS
 
@@ -53,6 +54,13 @@ def test_every_public_function_is_in_a_list():
     assert public == {*FUNCTIONS, *fits, *NO_BATCH}
     tested = {case.function for case in CASES.values()}
     assert tested == set(FUNCTIONS.values())
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_function_carries_on_any_mesh(name):
+    """Without it a call under explicit axes may work in one release of JAX and not in another."""
+    wrapper = _meshes.on_any_mesh(lambda: None).__code__
+    assert FUNCTIONS[name].__code__ is wrapper
 
 
 def assert_divided(answer):
