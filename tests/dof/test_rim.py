@@ -86,6 +86,7 @@ def test_what_the_rim_leaves_has_area_and_mean_of_each_row(iris, dtype):
             assert np.abs(mine * center[:, *at] - moment).max() < accuracy * radius**3
 
 
+@pytest.mark.full
 def test_the_open_share_is_that_of_two_discs():
     share_of = jax.jit(lambda vignetting: Iris(vignetting=vignetting).open_share(*SIZE))
     share = share_of(0.8)
@@ -150,6 +151,7 @@ SLOPES = [Iris(), Iris(5, 0.2, 0.3, 0.8), Iris(4, 0.3)]
     ("program", "iris"),
     [(p, x) for x in SLOPES for p in ("shift", "spans", "layered")],
 )
+@pytest.mark.full
 def test_derivatives(program, iris):
     rng = np.random.default_rng(2)
     image, weight = (jnp.asarray(rng.random((6, 7, 1))) for _ in range(2))
