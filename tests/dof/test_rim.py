@@ -147,11 +147,9 @@ def test_an_even_picture_stays_even(method):
 SLOPES = [Iris(), Iris(5, 0.2, 0.3, 0.8), Iris(4, 0.3)]
 
 
-@first(
-    ("program", "iris"),
-    [(p, x) for x in SLOPES for p in ("shift", "spans", "layered")],
-)
 @pytest.mark.full
+@pytest.mark.parametrize("iris", SLOPES)
+@pytest.mark.parametrize("program", ["shift", "spans", "layered"])
 def test_derivatives(program, iris):
     rng = np.random.default_rng(2)
     image, weight = (jnp.asarray(rng.random((6, 7, 1))) for _ in range(2))
