@@ -170,13 +170,13 @@ show(
 # %%
 for fitted_light, true_light in zip(fitted.lights, truth, strict=True):
     print(type(fitted_light).__name__)
-    for name in vars(true_light):
-        value, wanted = (
-            np.asarray(getattr(light, name)) for light in (fitted_light, true_light)
-        )
+    for name, value in vars(true_light).items():
+        if value is None:  # Neither has a size.
+            continue
+        found, wanted = (np.asarray(x, float) for x in (getattr(fitted_light, name), value))
         if name == "direction":
             wanted = wanted / np.linalg.norm(wanted)
-        print(f"  {name:12} {np.round(value, 3)!s:24} of {np.round(wanted, 3)}")
+        print(f"  {name:12} {np.round(found, 3)!s:24} of {np.round(wanted, 3)}")
 print(f"{len(fitted.losses)} losses, from {fitted.losses[0]:.1e} to {fitted.losses[-1]:.1e}")
 
 # %% [markdown]
