@@ -84,6 +84,9 @@ def effects():
         "relight.fill_holes": ((gbuffer, np.ones(SIZE, np.int32)), {}),
         "relight.capture_normals": ((lambda lights: jnp.asarray(image),), {}),
         "relight.indirect": ((gbuffer, transfer, [lamp]), {}),
+        "relight.mirrored": ((gbuffer, camera), {}),
+        "relight.refracted": ((gbuffer, camera), {}),
+        "relight.fresnel": ((gbuffer, camera), {}),
     }
 
 
