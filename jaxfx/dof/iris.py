@@ -383,7 +383,10 @@ class Cut(NamedTuple):
 
 
 def cuts(outline: Outline, reach: int) -> Cut:
-    """All rows, ring by ring, of sprites that reach so many pixels; along the first axis."""
+    """The rows of pixels of every ring, along the first axis, from the inner ring outwards.
+
+    `reach`: rows above and below its centre that the largest sprite covers, in pixels.
+    """
     if outline.rings is None:
         return Cut(jnp.arange(-reach, reach + 1), None, None)
     count = len(outline.rings)

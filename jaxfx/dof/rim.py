@@ -63,7 +63,7 @@ def rimmed(
     center: Float[Array, "2 height width"],
     toward: Float[Array, "2 height width"] | None,
 ) -> tuple["Pieces", Rim]:
-    """What the second disc leaves of an outline's pieces, per pixel, and the arcs between.
+    """The outline's pieces cut by the second disc, per pixel, and the arcs that close the gaps.
 
     The pieces follow one another. `half` is half of the longest chord. `toward` is the
     direction of `center`, and says that the pieces are of the unit circle: the two circles then

@@ -85,7 +85,7 @@ class Model(eqx.Module):
     - `iris`: the shape of the lens, whose numbers are those of the values; None for the disc.
     - `names`: the parameters that are sought.
     - `max_coc`: the largest circle of confusion that is drawn, in pixels.
-    - `peels`: whether the second layer is guessed, anew for each lens.
+    - `peels`: whether `dof.peel` guesses the second layer, again for every lens that is tried.
     """
 
     images: Images

@@ -27,7 +27,7 @@ _RESULTS: Any = optx.RESULTS
 
 
 class _State(NamedTuple):
-    """What is known at the last accepted unknowns, and the step that is tried next.
+    """Residual and Jacobian at the last accepted unknowns, and the unknowns to evaluate next.
 
     - `tried`: the unknowns to evaluate next.
     - `residual`: at the accepted unknowns.

@@ -109,7 +109,7 @@ def test_the_threshold_of_layered_scatter_is_found():
 
 @pytest.mark.full
 def test_a_second_layer_is_guessed_for_each_lens_that_is_tried():
-    """What `layered` draws with a guess is fitted exactly with one, and not without."""
+    """Of an image that `layered` drew with its guess, only a fit with the guess is exact."""
     image, depth = still_life(24)
     start, truth = ThinLens(0.14, 2.8, 100.0), ThinLens(0.12, 3.0, 100.0)
     photograph = dof.layered(image, depth, truth, max_coc=8.0)

@@ -95,10 +95,11 @@ def _sums(
 
 
 def _kernels(outputs: list[Any], most: int) -> list[list[int]]:
-    """Which planes of the outputs are summed together: of a stack, at most so many.
+    """Indices of the planes that each kernel sums.
 
-    A stack's share one weight. Those that stand alone share more than that: only two of them,
-    as one array, are computed without keeping it.
+    The planes of a stack share one weight per tap: at most `most` of them go into a kernel.
+    Planes outside of stacks share more than a weight. Two of them, as one complex array, are
+    summed without writing the shared values to memory; with more XLA would write them.
     """
     kernels, first = [], 0
     for stands_alone, alike in itertools.groupby(outputs, lambda x: not isinstance(x, list)):
