@@ -249,3 +249,18 @@ def test_errors_name_what_is_wrong():
     ):
         with pytest.raises(ValueError, match=rf"Iris\({name}\)"):
             inspect.unwrap(Iris)(**{name: wrong})
+
+
+def test_a_batch_of_rims_is_each_by_itself():
+    rng = np.random.default_rng(5)
+    image, depth = jnp.asarray(rng.random((6, 7, 1))), jnp.asarray(rng.uniform(1, 8, (6, 7)))
+    draw = lambda numbers: dof.scatter(
+        image,
+        depth,
+        ThinLens(0.1, 2.0, 60.0),
+        iris=Iris(vignetting=numbers[0], profile=numbers[1], rings=2),
+        max_coc=6.0,
+    )
+    numbers = jnp.array([[0.2, 0.5], [0.9, -0.4]])
+    each = jnp.stack([jax.jit(draw)(x) for x in numbers])
+    np.testing.assert_allclose(jax.jit(jax.vmap(draw))(numbers), each, atol=1e-12)

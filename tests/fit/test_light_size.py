@@ -222,3 +222,10 @@ def test_a_size_that_no_shadow_reads_is_said():
     result = found(image, PointLight, visibilities=None, parameters=parameters)
     assert not result.success
     assert np.isinf(result.standard_errors[0]["light_size"])
+
+
+@pytest.mark.parametrize("size", [0.0, -0.1, float("nan")])
+@pytest.mark.parametrize("make", [DirectionalLight, PointLight])
+def test_a_size_is_positive(make, size):
+    with pytest.raises(ValueError, match=r"light_size"):
+        make([0.0, 0, 1], [1.0, 1, 1], light_size=size)
