@@ -23,15 +23,17 @@ from jaxfx._platform import by_platform
 _GROUP = 8
 
 
-def apart(image: Array, compute: Callable[[], Array]) -> Array:
+def apart(array: Array, compute: Callable[[], Any]) -> Any:
     """The result of `compute`, kept in memory, so that its readers do not compute it again.
 
     XLA:CPU fuses what leads to a value into each reader: nine shifted reads of an `exp` compute
     nine of them. jaxlib 0.10 drops `optimization_barrier` before it fuses; 0.12 keeps it. So
     the value comes from a branch that is always taken, for which an accelerator would have to
-    wait. `image` is any float array of the program: the predicate reads its first element.
+    wait. `array` is any float array of the program: the predicate reads its first element, and
+    holds for a NaN too.
     """
-    branch = lambda: stored(image.reshape(-1)[0] >= -jnp.inf, compute)
+    first = array.reshape(-1)[0]
+    branch = lambda: stored((first >= -jnp.inf) | jnp.isnan(first), compute)
     return by_platform(cpu=branch, accelerator=lambda: lax.optimization_barrier(compute()))
 
 

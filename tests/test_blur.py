@@ -251,6 +251,18 @@ def test_a_bad_pixel_spoils_what_its_taps_reach(pixel, value, sampling):
     assert np.isfinite(out[..., ::2]).all()
 
 
+@pytest.mark.parametrize("sampling", ["discrete", "linear"])
+def test_a_bad_first_pixel_spoils_no_more_where_there_are_many_taps(sampling):
+    """Many taps are added in groups, which read the first pixel."""
+    image = random_image(30, 34)
+    clean = np.asarray(blur.gaussian(image, sampling=sampling, sigma=3.0))
+    image[0, 0] = np.nan
+    out = np.asarray(blur.gaussian(image, sampling=sampling, sigma=3.0))
+    is_near = np.zeros((30, 34, 1), bool)
+    is_near[:13, :13] = True
+    np.testing.assert_allclose(out, np.where(is_near, np.nan, clean), rtol=1e-12)
+
+
 def test_a_constant_stays():
     for sigma in (None, 2.0):
         out = blur.gaussian(np.full((17, 19, 3), 0.3, np.float32), passes=4, sigma=sigma)

@@ -34,6 +34,13 @@ def test_a_stored_value_that_is_not_needed_is_zero():
         np.testing.assert_array_equal(out["twice"], is_needed * 2 * np.arange(3.0))
 
 
+@pytest.mark.parametrize("first", [np.nan, np.inf, -np.inf])
+def test_what_is_kept_apart_does_not_depend_on_the_number_that_is_looked_at(first):
+    array = np.array([first, 1.0, 2.0])
+    program = jax.jit(lambda x: jaxfx._xla.apart(x, lambda: {"twice": 2 * x}))
+    np.testing.assert_array_equal(program(array)["twice"], 2 * array)
+
+
 @pytest.mark.parametrize("axis", [0, 1, -1])
 def test_planes_are_summed_over_any_axis(axis):
     planes = np.random.default_rng(0).random((3, 4, 5))
