@@ -5,7 +5,6 @@ prints the table of `docs/relight.md`, in a minute.
 """
 
 import argparse
-import dataclasses
 from io import BytesIO
 from pathlib import Path
 
@@ -13,38 +12,12 @@ import numpy as np
 from matplotlib import pyplot as plt
 from PIL import Image
 
+from benchmarks.scenes.relight import about_y, still_life, surroundings
 from jaxfx import EnvironmentLight, GBuffer, PinholeCamera, io, relight, scene
 
 
 SIZE = {"height": 216, "width": 288}
 TURNS = (0, 120, 240)
-
-
-def surroundings(height: int = 128) -> np.ndarray:
-    """A picture of all directions: a blue sky with a low sun behind haze, brown ground."""
-    rows, columns = np.mgrid[:height, : 2 * height] + 0.5
-    above, right = np.pi * (0.5 - rows / height), np.pi * (columns / height - 1)
-    way = [np.cos(above) * np.sin(right), np.sin(above), -np.cos(above) * np.cos(right)]
-    way = np.stack(way, axis=-1)
-    is_up = 1 / (1 + np.exp(-12 * way[..., 1:2]))
-    sky = np.array([0.25, 0.45, 0.9]) + np.array([0.5, 0.4, 0.2]) * (1 - np.abs(way[..., 1:2]))
-    picture = is_up * sky + (1 - is_up) * np.array([0.22, 0.15, 0.1])
-    sun = np.array([-0.7, 0.5, 0.3]) / np.linalg.norm([-0.7, 0.5, 0.3])
-    near = (way @ sun)[..., None] - 1
-    glow = np.array([4, 3, 2]) * np.exp(12 * near) + np.array([40, 34, 26]) * np.exp(200 * near)
-    return (picture + glow).astype(np.float32)
-
-
-def about_y(degrees: float) -> np.ndarray:
-    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
-    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-
-
-def still_life() -> scene.Scene:
-    """The still life, every material shaded by GGX."""
-    room = scene.still_life()
-    materials = [dataclasses.replace(m, shader="ggx") for m in room.materials]
-    return dataclasses.replace(room, materials=tuple(materials))
 
 
 def balls() -> tuple[GBuffer, PinholeCamera]:

@@ -41,6 +41,47 @@ def test_edit(benchmark):
     in_turns(benchmark, {f"{count} lights": edit(count) for count in (1, 10, 100, 1000)})
 
 
+@pytest.mark.parametrize("shader", scenes.SHADERS)
+def test_sliders(benchmark, shader):
+    """A light of each kind added to a state without it, and edited; and their pictures."""
+    benchmark.group = f"one light on a slider and its picture, {shader}"
+    gbuffer, camera = scenes.cache_of(SIZE, shader)
+    rest = relight.start(gbuffer, camera, scenes.lights(2))
+    calls = {}
+    for kind in scenes.KINDS:
+        state = rest.add(scenes.light_of(kind, 0))
+        turned = scenes.light_of(kind, 20)
+        calls[f"{kind}, added"] = waited(lambda light=turned: rest.add(light).image)
+        calls[f"{kind}, edited"] = waited(
+            lambda state=state, light=turned: state.edit(2, light).image
+        )
+    in_turns(benchmark, calls)
+
+
+def test_one_light_by_shader(benchmark):
+    benchmark.group = "the picture under one point light, by shader"
+    lamp = scenes.light_of("point", 0)
+
+    def shade(shader):
+        gbuffer, camera = scenes.cache_of(SIZE, shader)
+        return waited(lambda: relight.shade(gbuffer, camera, lamp))
+
+    in_turns(benchmark, {shader: shade(shader) for shader in scenes.SHADERS}, rounds=41)
+
+
+@pytest.mark.parametrize("shader", ["Blinn", "GGX"])
+def test_render_of_8(benchmark, shader):
+    """One light and 8, in turns: of one, the surface is made as for 8."""
+    benchmark.group = f"the picture under 1 and 8 point lights, {shader}"
+    gbuffer, camera = scenes.cache_of(SIZE, shader)
+
+    def render(count):
+        lights = scenes.lights(count)
+        return waited(lambda: relight.render(gbuffer, camera, lights))
+
+    in_turns(benchmark, {f"{count} lights": render(count) for count in (1, 8)}, rounds=31)
+
+
 @pytest.mark.parametrize("what", ["diffuse", "roughness of 10 lights"])
 def test_paint(benchmark, what):
     benchmark.group = "another material and its picture"

@@ -6,7 +6,8 @@ import numpy as np
 
 
 def in_turns(benchmark, functions, *, rounds=15, calls=1):
-    """The median time of each, in milliseconds: printed, and kept with the run.
+    """The median time of each, in milliseconds: printed with its quartiles and the least, and
+    kept with the run.
 
     A turn is of several calls where another's threads still spin at its start: then only its
     second half counts. (Twice the time at the first call after OpenCV, nothing after some ten.)
@@ -25,7 +26,12 @@ def in_turns(benchmark, functions, *, rounds=15, calls=1):
 
     benchmark.pedantic(one_round, rounds=rounds, warmup_rounds=1)
     # Without the round that warms up.
-    milliseconds = {name: 1e3 * float(np.median(each[1:])) for name, each in times.items()}
+    spread = {
+        name: 1e3 * np.percentile(each[1:], (50, 25, 75, 0)) for name, each in times.items()
+    }
+    milliseconds = {name: float(each[0]) for name, each in spread.items()}
     benchmark.extra_info |= milliseconds
-    print("\n" + ", ".join(f"{name}: {each:.2f} ms" for name, each in milliseconds.items()))
+    for name, (median, low, high, least) in spread.items():
+        print(f"\n{name}: {median:.2f} ms ({low:.2f} to {high:.2f}, least {least:.2f})", end="")
+    print()
     return milliseconds

@@ -14,9 +14,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxfx._arguments import alike
 from jaxfx._loops import scan
+from jaxfx._xla import apart
 from jaxfx.light import AmbientLight, Light
 from jaxfx.relight.shading import (
     Surface,
+    colored,
     in_shadow,
     received,
     stack_visibilities,
@@ -82,12 +84,11 @@ def _with_term(
     sign: Float[Array, ""],
 ) -> Sums:
     """The sums with one light's term times `sign`."""
-    terms = jax.checkpoint(received, prevent_cse=False)(surface, light)
-    terms = in_shadow(surface, light, terms, visibility)
+    # Each part is read several times below.
+    again = jax.checkpoint(received, prevent_cse=False)
+    parts = apart(sign, lambda: again(surface, light))
+    terms = colored(light, in_shadow(surface, light, parts, visibility))
     terms = {index: term for index, term in enumerate(terms) if term is not None}
-    # Each is read several times below. On a CPU, XLA of jaxlib 0.12 computes them once, with
-    # a third less work; that of 0.10 drops the barrier and computes them again for each.
-    terms = jax.lax.optimization_barrier(terms)
     are_finite = (jnp.isfinite(term).all(axis=-1) for term in terms.values())
     is_finite = functools.reduce(jnp.logical_and, are_finite)
     parts: list[Any] = [sums.diffuse, sums.specular, sums.grazing]

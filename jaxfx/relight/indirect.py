@@ -15,7 +15,7 @@ from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
 from jaxfx.gbuffer import GBuffer
 from jaxfx.light import AmbientLight, Light
-from jaxfx.relight.shading import Surface, check_shader, received
+from jaxfx.relight.shading import Surface, check_shader, colored, received
 from jaxfx.transfer import Transfer
 
 
@@ -111,7 +111,7 @@ def _indirect(gbuffer, transfer, lights, visibilities, bounces):
     irradiance = jnp.zeros_like(transfer.diffuse)
     for light, visibility in zip(lights, visibilities, strict=True):
         if not isinstance(light, AmbientLight):
-            term = received(surface, light)[0][0]
+            term = colored(light, received(surface, light))[0][0]
             irradiance += (
                 term if visibility is None else visibility.astype(dtype)[:, None] * term
             )
@@ -140,5 +140,6 @@ def _as_surface(transfer: Transfer) -> Surface:
         specular=zero,
         exponent=jnp.zeros_like(one_row),
         facing=None,
-        returned=None,
+        lobe=None,
+        conserves=None,
     )

@@ -47,11 +47,20 @@ from jaxfx.light import (
     SphericalHarmonicsLight,
     SpotLight,
 )
-from jaxfx.relight._ggx import lobe_and_fresnel, mean_grazing, mean_lobe, roughness_squared
+from jaxfx.relight._ggx import (
+    MeanLobe,
+    lobe_and_fresnel,
+    mean_grazing,
+    mean_lobe,
+    roughness_squared,
+)
 
 
 _Vectors = Float[Array, "height width 3"]
 _Scalars = Float[Array, "height width"]
+_Part = Float[Array, "height width #3"]
+# Diffuse, specular and grazing light. One channel stands for three that are the same.
+Parts = tuple[_Part, _Part | None, _Part | None]
 # Numbers of shaders in a G-buffer; 0, Lambert, has no highlight; 2 is Blinn.
 _NOTHING, _PHONG, _GGX, _CONSERVING = -1, 1, 3, 4
 # Length of a vector: scene units, of those to lights. A shorter vector is divided by this in
@@ -201,9 +210,9 @@ class Surface(NamedTuple):
     """The visible surface, per pixel: the part of shading that depends on no light.
 
     `normal` and `to_camera` are unit vectors in world space; the three reflectances are linear
-    RGB; `exponent` is that of the highlight. `facing` is N.V, which GGX reads, or None where no
-    pixel can have that shader: a program then has nothing of it. Likewise `returned`, which
-    GGX that conserves energy reads: of `response`.
+    RGB; `exponent` is that of the highlight. `facing` is N.V and `lobe` the highlight of light
+    from everywhere, which GGX reads, or None where no pixel can have that shader: a program
+    then has nothing of them. Likewise `conserves`, which is true of GGX that conserves energy.
     """
 
     shader: Int[Array, "height width"]
@@ -215,7 +224,8 @@ class Surface(NamedTuple):
     specular: _Vectors
     exponent: _Scalars
     facing: _Scalars | None
-    returned: Float[Array, "height width 2"] | None
+    lobe: MeanLobe | None
+    conserves: Bool[Array, "height width"] | None
 
 
 def ggx_kinds(gbuffer: GBuffer) -> int:
@@ -229,13 +239,9 @@ def ggx_kinds(gbuffer: GBuffer) -> int:
     return 2 if (shader == _CONSERVING).any() else int((shader == _GGX).any())
 
 
-def response(facing: _Scalars, exponents: _Scalars) -> Float[Array, "height width 2"]:
-    """Directional albedo of a highlight under white light from everywhere, by N.V.
-
-    Two ratios: the first is multiplied by `specular`, the second is added.
-    """
-    lobe = mean_lobe(facing, jnp.sqrt(roughness_squared(exponents)))
-    return jnp.stack([lobe.specular, lobe.grazing], axis=-1)
+def lobe_of(facing: _Scalars, exponents: _Scalars) -> MeanLobe:
+    """The highlight of light from everywhere, by N.V."""
+    return mean_lobe(facing, jnp.sqrt(roughness_squared(exponents)))
 
 
 def to_surface(gbuffer: GBuffer, camera: Camera | Rays, kinds: int) -> Surface:
@@ -275,7 +281,8 @@ def to_surface(gbuffer: GBuffer, camera: Camera | Rays, kinds: int) -> Surface:
         specular=masked(gbuffer.specular, 0, is_shiny),
         exponent=exponents,
         facing=facing,
-        returned=response(facing, exponents) if facing is not None and kinds == 2 else None,
+        lobe=None if facing is None else lobe_of(facing, exponents),
+        conserves=is_surface & (shader == _CONSERVING) if kinds == 2 else None,
     )
 
 
@@ -291,7 +298,7 @@ def reflected(surface: Surface, light: Light) -> _Vectors:
         color = light.color.astype(surface.position.dtype)
         image = color[None, None] * surface.ambient
     else:
-        image = with_reflectances(surface, *received(surface, light))
+        image = with_reflectances(surface, *colored(light, received(surface, light)))
     return jnp.where((surface.shader == _NOTHING)[..., None], 0, image)
 
 
@@ -303,10 +310,10 @@ def with_reflectances(
     if surface.facing is not None:
         is_gltf = (surface.shader == _GGX)[..., None]
         kept = jnp.where(is_gltf, 1 - surface.specular, 1)
-        if surface.returned is not None:
-            is_conserving = (surface.shader == _CONSERVING)[..., None]
-            share, besides = surface.returned[..., :1], surface.returned[..., 1:]
-            kept = jnp.where(is_conserving, 1 - surface.specular * share - besides, kept)
+        if surface.conserves is not None and surface.lobe is not None:
+            share, besides = surface.lobe.specular[..., None], surface.lobe.grazing[..., None]
+            left = 1 - surface.specular * share - besides
+            kept = jnp.where(surface.conserves[..., None], left, kept)
         matte = matte * kept
     image = matte * diffuse
     if specular is not None:
@@ -321,12 +328,13 @@ def received(
     | SpotLight
     | SphericalHarmonicsLight
     | EnvironmentLight,
-) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
-    """One light's diffuse, specular and grazing light, before the reflectances multiply it.
+) -> Parts:
+    """One light's diffuse, specular and grazing light, before color and reflectances.
 
-    For the diffuse one that is the irradiance; for the specular one irradiance times highlight.
-    Of GGX the two are less a share, which the grazing one has whatever the reflectance. None
-    stands for no highlights, and for no pixel of GGX.
+    `colored` multiplies the light's color, `with_reflectances` those of the surface. The
+    diffuse light is the irradiance, the specular one irradiance times highlight. Of GGX the two
+    are less a share, which the grazing one has whatever the reflectance. None stands for no
+    highlights, and for no pixel of GGX.
     """
     light = jax.tree.map(lambda leaf: leaf.astype(surface.position.dtype), light)
     if isinstance(light, SphericalHarmonicsLight):
@@ -337,10 +345,10 @@ def received(
     to_light, irradiance = _direction_and_irradiance(light, surface.position)
     cosine = _dot(surface.normal, to_light)
     halfway = _unit(to_light + surface.to_camera)
-    diffuse = irradiance * jnp.where(cosine <= 0, 0, cosine)[..., None]
+    diffuse = irradiance * jnp.where(cosine <= 0, 0, cosine)
     highlight = _highlight(surface, to_light, halfway, cosine)
     if surface.facing is None:
-        return diffuse, irradiance * highlight[..., None], None
+        return diffuse[..., None], (irradiance * highlight)[..., None], None
     is_ggx = surface.shader >= _GGX
     is_dark = (cosine <= 0) | (_dot(surface.normal, halfway) <= 0)
     lobe, grazing = lobe_and_fresnel(
@@ -351,11 +359,19 @@ def received(
         _one_minus_cosine(surface.normal, halfway),
         _one_minus_cosine(surface.to_camera, halfway),
     )
-    specular = irradiance * jnp.where(is_ggx, lobe, highlight)[..., None]
-    grazing = grazing[..., None]
+    specular = irradiance * jnp.where(is_ggx, lobe, highlight)
     # Of GGX that conserves energy, `with_reflectances` takes the highlight's share instead.
-    mixed = jnp.where((surface.shader == _CONSERVING)[..., None], 0, grazing)
-    return (1 - mixed) * diffuse, (1 - grazing) * specular, grazing * specular
+    mixed = jnp.where(surface.shader == _CONSERVING, 0, grazing)
+    parts = (1 - mixed) * diffuse, (1 - grazing) * specular, grazing * specular
+    return tuple(part[..., None] for part in parts)
+
+
+def colored(light: Light, parts: Parts) -> Parts:
+    """The parts of `received` times the light's color; its coefficients are one already."""
+    if isinstance(light, SphericalHarmonicsLight):
+        return parts
+    color = light.color[None, None]
+    return tuple(None if part is None else color.astype(part.dtype) * part for part in parts)
 
 
 def _on_matt(surface: Surface, irradiance: _Vectors) -> _Vectors:
@@ -367,26 +383,24 @@ def _on_matt(surface: Surface, irradiance: _Vectors) -> _Vectors:
     return jnp.where(has_normal[..., None], irradiance, 0)
 
 
-def _from_surroundings(
-    surface: Surface, light: EnvironmentLight
-) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
+def _from_surroundings(surface: Surface, light: EnvironmentLight) -> Parts:
     """The three parts of the light of an image of all directions."""
     column = lambda k: jnp.broadcast_to(light.world_from_image[:, k], surface.normal.shape)
     turned = lambda way: jnp.stack([_dot(way, column(k)) for k in range(3)], axis=-1)
-    color, blurs = light.color[None, None], (light.pyramid, light.heights)
+    blurs = light.pyramid, light.heights
     irradiance = _environment.irradiance(*blurs, turned(surface.normal))
-    diffuse = color * _on_matt(surface, irradiance)
-    if surface.facing is None:
+    diffuse = _on_matt(surface, irradiance)
+    if surface.facing is None or surface.lobe is None:
         return diffuse, None, None
     mirrored = 2 * surface.facing[..., None] * surface.normal - surface.to_camera
-    lobe = mean_lobe(surface.facing, jnp.sqrt(roughness_squared(surface.exponent)))
+    lobe = surface.lobe
     toward = surface.normal + lobe.mirrored[..., None] * (mirrored - surface.normal)
     rest = _environment.look_up(*blurs, turned(toward), lobe.roughness)
     matt = lobe.matt[..., None]
     reflected = matt * irradiance + (1 - matt) * rest
     is_ggx = (surface.shader >= _GGX) & (_dot(surface.normal, surface.normal) != 0)
     specular, grazing = (
-        jnp.where(is_ggx[..., None], color * reflected * mean[..., None], 0)
+        reflected * jnp.where(is_ggx, mean, 0)[..., None]
         for mean in (lobe.specular, lobe.grazing)
     )
     return diffuse, specular, grazing
@@ -394,15 +408,16 @@ def _from_surroundings(
 
 def _direction_and_irradiance(
     light: DirectionalLight | PointLight | SpotLight, position: _Vectors
-) -> tuple[_Vectors, Float[Array, "#height #width 3"]]:
-    """The unit vectors to `light`, and its irradiance on a surface that faces it."""
-    color = light.color[None, None]
+) -> tuple[_Vectors, _Scalars]:
+    """The unit vectors to `light`, and its irradiance on a surface that faces it, as a share of
+    its color."""
     if isinstance(light, DirectionalLight):
-        return jnp.broadcast_to(-normalize(light.direction), position.shape), color
+        to_light = jnp.broadcast_to(-normalize(light.direction), position.shape)
+        return to_light, jnp.ones_like(position[..., 0])
     offset = light.position[None, None] - position
-    to_light, irradiance = _unit(offset), color / _squared_length(offset)
+    to_light, irradiance = _unit(offset), 1 / _squared_length(offset)[..., 0]
     if isinstance(light, SpotLight):
-        irradiance = irradiance * _cone(light, to_light)[..., None]
+        irradiance = irradiance * _cone(light, to_light)
     return to_light, irradiance
 
 
@@ -482,7 +497,11 @@ def stack_visibilities(
     )
 
 
-def shadowed(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> _Vectors:
+def shadowed(
+    surface: Surface,
+    image: Float[Array, "height width #3"],
+    visibility: _Scalars | None,
+) -> Float[Array, "height width #3"]:
     """A light's image times its visibility, which is not read where there is no surface."""
     if visibility is None:
         return image
@@ -493,15 +512,15 @@ def shadowed(surface: Surface, image: _Vectors, visibility: _Scalars | None) -> 
 def in_shadow(
     surface: Surface,
     light: Any,
-    terms: tuple[_Vectors, _Vectors | None, _Vectors | None],
+    parts: Parts,
     visibility: Float[Array, "height width ..."] | None,
-) -> tuple[_Vectors, _Vectors | None, _Vectors | None]:
-    """The terms of `received` in the light's shadow.
+) -> Parts:
+    """The parts of `received` in the light's shadow.
 
     Where the visibility has coefficients, the diffuse light is their sum with the light's, and
     highlights are as bright as that is under a white sky.
     """
-    diffuse, *highlights = terms
+    diffuse, *highlights = parts
     if visibility is not None and visibility.ndim == 3:
         visibility = visibility.astype(surface.position.dtype)
         diffuse = _on_matt(surface, _by_coefficient(light, visibility))
@@ -510,7 +529,7 @@ def in_shadow(
     else:
         diffuse = shadowed(surface, diffuse, visibility)
     specular, grazing = (
-        None if term is None else shadowed(surface, term, visibility) for term in highlights
+        None if part is None else shadowed(surface, part, visibility) for part in highlights
     )
     return diffuse, specular, grazing
 
@@ -519,12 +538,11 @@ def _by_coefficient(
     light: SphericalHarmonicsLight | EnvironmentLight,
     visibility: Float[Array, "height width coefficient"],
 ) -> _Vectors:
-    """Radiance of a white Lambert surface under light from all around, by `scene.occlusion`."""
+    """Radiance of a white Lambert surface under light from all around, by `scene.occlusion`,
+    before the light's color."""
     coefficients = light.coefficients.astype(visibility.dtype)
     if isinstance(light, EnvironmentLight):
-        turn = light.world_from_image.astype(visibility.dtype)
-        color = light.color.astype(visibility.dtype)[None]
-        coefficients = turned(coefficients * color, turn)
+        coefficients = turned(coefficients, light.world_from_image.astype(visibility.dtype))
     count = min(visibility.shape[-1], len(coefficients))
     product = jnp.matmul(
         visibility[..., :count].reshape(-1, count), coefficients[:count], precision="highest"
@@ -540,8 +558,8 @@ def lit(
     """The image under one light in its shadow."""
     if visibility is None or visibility.ndim == 2 or isinstance(light, AmbientLight):
         return shadowed(surface, reflected(surface, light), visibility)
-    terms = in_shadow(surface, light, received(surface, light), visibility)
-    image = with_reflectances(surface, *terms)
+    parts = in_shadow(surface, light, received(surface, light), visibility)
+    image = with_reflectances(surface, *colored(light, parts))
     return jnp.where((surface.shader == _NOTHING)[..., None], 0, image)
 
 
