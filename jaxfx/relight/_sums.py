@@ -86,8 +86,8 @@ def _with_term(
     """The sums with one light's term times `sign`."""
     # Each part is read several times below.
     again = jax.checkpoint(received, prevent_cse=False)
-    parts = apart(sign, lambda: again(surface, light))
-    terms = colored(light, in_shadow(surface, light, parts, visibility))
+    unshadowed = apart(sign, lambda: again(surface, light))
+    terms = colored(light, in_shadow(surface, light, unshadowed, visibility))
     terms = {index: term for index, term in enumerate(terms) if term is not None}
     are_finite = (jnp.isfinite(term).all(axis=-1) for term in terms.values())
     is_finite = functools.reduce(jnp.logical_and, are_finite)

@@ -362,8 +362,9 @@ def received(
     specular = irradiance * jnp.where(is_ggx, lobe, highlight)
     # Of GGX that conserves energy, `with_reflectances` takes the highlight's share instead.
     mixed = jnp.where(surface.shader == _CONSERVING, 0, grazing)
-    parts = (1 - mixed) * diffuse, (1 - grazing) * specular, grazing * specular
-    return tuple(part[..., None] for part in parts)
+    diffuse = (1 - mixed) * diffuse
+    specular, grazing = (1 - grazing) * specular, grazing * specular
+    return diffuse[..., None], specular[..., None], grazing[..., None]
 
 
 def colored(light: Light, parts: Parts) -> Parts:
@@ -371,7 +372,10 @@ def colored(light: Light, parts: Parts) -> Parts:
     if isinstance(light, SphericalHarmonicsLight):
         return parts
     color = light.color[None, None]
-    return tuple(None if part is None else color.astype(part.dtype) * part for part in parts)
+    diffuse, specular, grazing = (
+        None if part is None else color.astype(part.dtype) * part for part in parts
+    )
+    return diffuse, specular, grazing
 
 
 def _on_matt(surface: Surface, irradiance: _Vectors) -> _Vectors:
