@@ -77,8 +77,10 @@ def alike(
     """
     if not _manual_axes():
         return branches, operands
-    results = [jax.eval_shape(branch, *operands) for branch in branches]
-    axes = _axes(results, index)
+    axes = _axes(operands, index)
+    # Where all varies already, the branches need not be traced to see it.
+    if axes != frozenset(_manual_axes()):
+        axes = _axes([jax.eval_shape(branch, *operands) for branch in branches], index)
     marked = [
         lambda *operands, branch=branch: _varying(branch(*operands), axes)
         for branch in branches

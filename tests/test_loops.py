@@ -46,16 +46,38 @@ EXPECTED = {
 }
 
 
+def mesh_of(*names):
+    """A mesh of one device, of automatic axes."""
+    return jax.make_mesh((1,) * len(names), names, axis_types=(AxisType.Auto,) * len(names))
+
+
 @pytest.mark.parametrize("function", EXPECTED, ids=lambda function: function.__name__)
 def test_loops_compute_the_same_inside_shard_map(function):
     batch = jnp.stack([jnp.ones((2, 3)), jnp.full((2, 3), 2.0)])
     expected = np.stack([EXPECTED[function](np.asarray(rows)) for rows in batch])
     np.testing.assert_allclose(jax.vmap(function)(batch), expected)
     spec, names = PartitionSpec("batch"), ("batch", "other")
-    mesh = jax.make_mesh((1, 1), names, axis_types=(AxisType.Auto,) * 2)
-    # The other axis is not among those over which the result varies, or it would be refused.
-    mapped = jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec)
-    np.testing.assert_allclose(jax.jit(mapped)(batch), expected)
+    for count in (1, 2):
+        mesh = mesh_of(*names[:count])
+        # The result does not vary over the other axis, or it would be refused.
+        mapped = jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec)
+        np.testing.assert_allclose(jax.jit(mapped)(batch), expected)
+
+
+def test_branches_of_what_varies_are_traced_once():
+    """Else branches in branches would take twice the time for each level."""
+    traced = []
+
+    def branch(x):
+        traced.append(x)
+        return x
+
+    spec = PartitionSpec("batch")
+    mapped = lambda x: cond(x[0] > 0, branch, lambda x: -x, x)
+    jax.eval_shape(
+        jax.shard_map(mapped, mesh=mesh_of("batch"), in_specs=spec, out_specs=spec), jnp.ones(3)
+    )
+    assert len(traced) == 1
 
 
 def test_a_loop_inside_an_unchecked_shard_map():

@@ -143,9 +143,9 @@ def _drawn(image, depth, lens, ramp, max_coc, disc, at_once=1):
         # Where the low-resolution image has no pixel of known depth, the tap alone counts.
         share = jnp.where(soft[..., -1] > 0, blur, 0)
         tap = mix(tap, _mean(soft), share[..., None])
-        behind = (defocus >= centre - rounding).astype(image.dtype)
-        ahead = (centre - defocus) / jnp.where(ramp > 0, ramp, 1)
-        behind = jnp.where(ramp > 0, clip01(1 - ahead), behind)
+        ahead = centre - rounding - defocus
+        soft_test = clip01(1 - ahead / jnp.where(ramp > 0, ramp, 1))
+        behind = jnp.where(ramp > 0, soft_test, (ahead <= 0).astype(image.dtype))
         weight = (known * (behind + (1 - behind) * blur))[..., None]
         return (sums[0] + weight * tap, sums[1] + weight), None
 

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxfx.fit._jackknife import principal
+
 
 # The standard deviation of that error, as a ratio to a circle of confusion and in pixels, and
 # the number of groups ("strata") by defocus, each of which has its own error. The ratio and
@@ -40,19 +42,16 @@ def variances(
     block = jnp.repeat(stratum.reshape(-1), channels)
     circle = jnp.repeat(jnp.nan_to_num(jnp.abs(defocus)).reshape(-1), channels)
     absolute = _PIXELS * widening / jnp.maximum(circle, _POINT)
-    norms = jnp.linalg.norm(columns, axis=0)
-    norms = jnp.where(norms > 0, norms, 1)
-    scaled = columns / norms[None]
+    axes = principal(columns)
     errors = jnp.concatenate(
         [
-            jax.ops.segment_sum(scaled * error[:, None], block, _STRATA)
+            jax.ops.segment_sum(axes.along * error[:, None], block, _STRATA)
             for error in (_RATIO * widening, absolute)
         ]
     )
-    eigenvalues, vectors = jnp.linalg.eigh(scaled.T @ scaled)
     # The bound keeps what no pixel determines finite, and large.
-    inverse = 1 / jnp.maximum(eigenvalues, 64 * jnp.finfo(columns.dtype).eps)
-    moves = (errors @ vectors * inverse[None]) @ vectors.T / norms[None]
+    squares = jnp.maximum(axes.squares, 64 * jnp.finfo(columns.dtype).eps)
+    moves = (errors / squares[None]) @ axes.basis.T
     return jnp.sum(moves**2, axis=0)
 
 

@@ -245,11 +245,12 @@ def _ranked(
 def _shrink(model: Model, max_coc: int | float | None) -> int:
     """The whole factor by which the first images are smaller.
 
-    It decides shapes, so that under a transform it can't depend on data: the largest circle of
-    confusion at the start is then taken for half of `max_coc`.
+    It decides shapes, which can't depend on data under a transform. There `max_coc` is given:
+    the largest circle of confusion at the start is then taken for half of it, under a transform
+    or not, so that both find the same.
     """
     side = max(model.images.depth.shape)
-    if max_coc is not None and not is_concrete(model):
+    if max_coc is not None:
         largest = max_coc / _TRIED_MARGIN
     else:
         circles = model.circles(model.start)

@@ -185,7 +185,8 @@ def dof(
     - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
       may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.
-    - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any.
+    - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any. If
+      given, it decides how small the images of the first searches are, else the start does.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
     - `loss`: `"robust"`, or `"squares"` for images that the effect itself made: all pixels
@@ -214,8 +215,7 @@ def dof(
     **Gradient:** none through the search: it stops at every step to report. Under `jit` and
     `vmap` it is a part of the program, of a batch one after the other on the device where each
     member lies; `throw` and `progress` must then be false, and `max_coc` be given.
-    For it the images of the first searches are smaller by a factor that follows from
-    `max_coc`, and NaN fills up `losses`.
+    NaN then fills up `losses`.
 
     **Example:** the aperture of a blurred image.
 

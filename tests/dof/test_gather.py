@@ -12,6 +12,7 @@ from jaxfx import FocusPlanes, ThinLens, dof
 from jaxfx.dof._discs import vogel
 from jaxfx.dof.gather import low_resolution
 from tests.helpers.forms import first
+from tests.test_transforms import CASES
 
 
 # Of the paper, once more: these are what it prints.
@@ -96,6 +97,24 @@ def test_the_low_resolution_picture_of_a_frame_of_whole_blocks_is_the_mean_of_ea
     kernel = np.outer([1, 2, 1], [1, 2, 1])[:, :, None] / 16
     expected = ndimage.convolve(means, kernel, mode="nearest")
     np.testing.assert_allclose(low_resolution(jnp.asarray(image)), expected, atol=1e-14)
+
+
+@pytest.mark.full
+def test_the_derivative_of_a_batch_is_that_of_each_member():
+    """At a corner a tap reads its own pixel, from which it differs by rounding alone."""
+    members = [CASES["dof.gather"].split(seed=seed, size=(9, 7)) for seed in range(8)]
+    call = members[0][0]
+
+    def slopes(arguments):
+        out, pull = jax.vjp(call, arguments)
+        return out, pull(out)
+
+    stacked = lambda trees: jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+    batch = stacked([arguments for _, arguments in members])
+    loop = stacked(list(map(jax.jit(slopes), [arguments for _, arguments in members])))
+    found = jax.jit(jax.vmap(slopes))(batch)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(loop), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_a_sharp_foreground_does_not_leak_and_a_blurred_one_has_a_hard_rim():

@@ -7,6 +7,7 @@ import optimistix as optx
 import pytest
 
 from jaxfx import ThinLens, fit
+from jaxfx.fit import _lens_model
 from tests.helpers.fits import CAMERA, DEPTH, FITS, LENS
 
 
@@ -32,6 +33,27 @@ def test_a_batch_of_fits_is_a_loop(name):
     for at in range(2):
         one = jax.tree.map(lambda leaf, at=at: leaf[at], batch)
         assert_equal(one, fitted(*(each[at] for each in data)))
+
+
+class Shrunk(Exception):
+    """Raised in place of a search, with the factor by which its first images are smaller."""
+
+
+def test_a_search_begins_at_the_same_size_under_a_transform_and_outside(monkeypatch):
+    """The start's circles of confusion, of some 5 pixels, would ask for no smaller images."""
+
+    def shrunk(images, factor):
+        raise Shrunk(factor)
+
+    monkeypatch.setattr(_lens_model.Images, "shrunk", shrunk)
+    image = np.random.default_rng(0).random((8, 320, 1))
+    depth = np.broadcast_to(np.linspace(2.0, 4.0, 320), (8, 320))
+    options = {"max_coc": 20.0, "throw": False}
+    search = lambda aperture: fit.dof(image, image, depth, ThinLens(aperture, 3, 40), **options)
+    for call in (search, jax.jit(search)):
+        with pytest.raises(Shrunk) as caught:
+            call(jnp.asarray(0.5))
+        assert caught.value.args == (2,)
 
 
 def test_what_a_search_under_a_transform_can_not_do_is_refused():

@@ -46,6 +46,24 @@ def test_the_covariance_is_that_of_leaving_each_block_out():
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-12)
 
 
+def test_two_unknowns_that_are_hard_to_tell_apart_keep_their_digits():
+    """Against a decomposition of the columns themselves; that of their square loses ten."""
+    rng = np.random.default_rng(2)
+    columns, block = rng.normal(size=(90, 3)) * [1, 1e-5, 10], np.arange(90) % 9
+    columns[:, 1] += columns[:, 0]
+    aim = rng.normal(size=90)
+    solved = lambda kept: np.linalg.lstsq(columns[kept], aim[kept], rcond=None)[0]
+    moves = np.array([solved(block != i) for i in range(9)])
+    away = moves - np.mean(moves, axis=0)
+    residual = columns @ solved(block >= 0) - aim
+    found = _jackknife.covariance(*map(jnp.asarray, (columns, residual, block)), 9)
+    np.testing.assert_allclose(found, 8 / 9 * away.T @ away, rtol=1e-8, atol=1e-12)
+    inverse = np.linalg.pinv(columns, rcond=1e-14)
+    errors = np.sqrt(np.sum(inverse**2, axis=1) * np.sum(residual**2) / 87)
+    found = _jackknife.independent_errors(*map(jnp.asarray, (columns, residual)))
+    np.testing.assert_allclose(found, errors, rtol=1e-8)
+
+
 def test_what_nothing_tells_has_no_finite_error():
     rng = np.random.default_rng(1)
     columns, residual = rng.normal(size=(80, 3)), jnp.asarray(rng.normal(size=80))

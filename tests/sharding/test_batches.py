@@ -1,4 +1,7 @@
-"""Batches that are spread over eight devices along their first axis, effect by effect."""
+"""Batches that are spread over eight devices along their first axis, effect by effect.
+
+Those of `dof`, the most to compile, are in a file of their own, which another process runs.
+"""
 
 import importlib
 import inspect
@@ -74,17 +77,38 @@ def test_a_batch_is_computed_where_it_lies(eight_devices, name, mesh):
     assert_divided(eight_devices("batch", name=name, mesh=mesh, gradient=False))
 
 
+def meshes_of(name):
+    """The meshes on which a case is tested: as many as its code differs on.
+
+    A function with its default options is tested on all of them. An option whose value has a
+    program of its own is not tested on automatic axes: on explicit ones a function runs as on
+    those. What is computed for an argument that is left out is tested on one mesh, and a case
+    that differs by a type of argument alone on none.
+    """
+    if name in FUNCTIONS:
+        return MESHES
+    if not CASES[name].is_option:
+        return ()
+    return ("explicit",) if name.endswith("=None") else ("explicit", "shard_map")
+
+
+def size_of(name):
+    """The height and width of a case's images: a score needs a whole window."""
+    return (13, 11) if name.startswith("metrics.") else (9, 7)
+
+
+def on_meshes(cases):
+    """Parametrize by cases, each on its meshes, one after the other: they share a reference."""
+    pairs = [(name, mesh) for name in cases for mesh in meshes_of(name)]
+    return pytest.mark.parametrize(("name", "mesh"), pairs)
+
+
 @pytest.mark.full
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("mesh", MESHES)
+@on_meshes([name for name in CASES if not name.startswith("dof.")])
 def test_every_function_and_its_gradient_are_computed_where_a_batch_lies(
     eight_devices, name, mesh
 ):
-    if name not in FUNCTIONS and not CASES[name].is_option:
-        pytest.skip("goes through the code of another case")
-    # A score needs a whole window.
-    size = (13, 11) if name.startswith("metrics.") else (9, 7)
-    assert_divided(eight_devices("batch", name=name, mesh=mesh, size=size))
+    assert_divided(eight_devices("batch", name=name, mesh=mesh, size=size_of(name)))
 
 
 @pytest.mark.full

@@ -21,9 +21,9 @@ def test_rows_are_computed_with_their_neighbours(eight_devices, name):
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("mesh", ["explicit", "auto"])  # They share a reference.
 @pytest.mark.parametrize("height", [64, 61, 75])
 @pytest.mark.parametrize("name", SLOW + QUICK)
-@pytest.mark.parametrize("mesh", ["explicit", "auto"])
 def test_rows_of_any_height_are_those_of_one_device(eight_devices, name, mesh, height):
     assert_same(eight_devices("rows", name=name, mesh=mesh, height=height))
 
