@@ -24,12 +24,13 @@ from jaxfx._loops import fori_loop
 from jaxfx._numerics import clip01
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._compositing import (
-    Filling,
+    Record,
     begin_reading,
     fill,
     lit,
     nothing_filled,
     read_slice,
+    recorded,
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
 from jaxfx.dof.kernels._taps import inside
@@ -219,13 +220,17 @@ def _away(
     return sheet.place[None] - slices.astype(sheet.place.dtype)[:, None, None]
 
 
-def _filled(extent: Extent, sheets: Sheets) -> Filling:
+def record(
+    extent: Extent, sheets: Sheets
+) -> tuple[Float[Array, "twice_value height width"], Record]:
+    """The result of `forward`, and what `adjoint` needs of it."""
+
     def add(_sheet, number, first, arriving, _reach, state):
         for k, each in enumerate(arriving):
             state = fill(number * APART + first + k, each, state)
         return state
 
-    return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
+    return recorded(_each_group(extent, sheets, add, nothing_filled(extent, sheets)))
 
 
 def forward(
@@ -251,10 +256,13 @@ def tangent(
 
 
 def adjoint(
-    extent: Extent, sheets: Sheets, bar: Float[Array, "twice_value height width"]
+    extent: Extent,
+    sheets: Sheets,
+    bar: Float[Array, "twice_value height width"],
+    record: Record,
 ) -> Sheets:
     """The transpose of `tangent`."""
-    reading = begin_reading(_filled(extent, sheets), bar)
+    reading = begin_reading(record, bar)
 
     def read(sheet, number, first, arriving, reach, state):
         bars, carry = state
@@ -347,4 +355,4 @@ def _read_back(
     return jax.tree.map(lambda x: jnp.where(value[-1] > 0, x, 0), found)
 
 
-SHEET_ROWS = Program(*map(together, (forward, tangent, adjoint)))
+SHEET_ROWS = Program(*map(together, (forward, tangent, adjoint, record)))
