@@ -22,8 +22,8 @@ class Program(NamedTuple):
     - `forward(reach, planes)`: the sums.
     - `tangent(reach, planes, dot)`: their derivative along `dot`.
     - `adjoint(reach, planes, bar)`: the transpose of that.
-    - `recorded(reach, planes)`: the sums and a record of them, arrays of floats, which `adjoint`
-      then takes as a fourth argument. None where it needs no record.
+    - `recorded(reach, planes)`: the sums and a record of them, arrays of floats, which
+      `adjoint` then takes as a fourth argument. None where it needs no record.
     """
 
     forward: Callable[[Any, Any], Array]
@@ -90,6 +90,7 @@ def with_adjoint(
     def _(reach: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
         (out, record), out_dot = value_and_tangent(reach, *primals, *tangents)
         # What the record has to do with the planes, `derivative` knows.
-        return (out, record), (out_dot, varying_as(record, jax.tree.map(jnp.zeros_like, record)))
+        zeros = varying_as(record, jax.tree.map(jnp.zeros_like, record))
+        return (out, record), (out_dot, zeros)
 
     return kernel

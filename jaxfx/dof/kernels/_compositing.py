@@ -5,9 +5,9 @@ takes as much of the lens as is left; what lies behind a full lens is hidden. Th
 slice takes gets the fallback colour: a mean of the slices, each weighted by how full the lens
 was when it was added.
 
-The adjoint does not store the slices. Per pixel a record holds the number of the slice that filled
-the lens, its colour, and the fraction of it that found room. A slice in front of that one is
-added in full, and the room that it takes is lost to the slice that fills the lens.
+The adjoint does not store the slices. Per pixel a record holds the number of the slice that
+filled the lens, its colour, and the fraction of it that found room. A slice in front of that
+one is added in full, and the room that it takes is lost to the slice that fills the lens.
 """
 
 from typing import NamedTuple

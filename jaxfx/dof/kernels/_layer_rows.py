@@ -11,7 +11,6 @@ every slice of the group, whatever the image holds.
 """
 
 import functools as ft
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -328,7 +327,7 @@ def _read_back(
             at_end, at_start = inside(end + edge), inside(start + edge)
             value = [*map(at_pixel, sheet.value)]
             light = of_sprite(map(at_pixel, shares), [of_sprite(value, there(x)) for x in seen])
-            # Both ends are moved by a third of the tilt times the square of half their distance.
+            # Both ends are moved by a third of the tilt times half their distance squared.
             distance, third = end - start, at_pixel(sheet.tilt[0] / 3)
             facing = 1 + at_pixel(sheet.tilt[1]) * row
             moved = facing * (at_end - at_start) * distance
@@ -337,7 +336,8 @@ def _read_back(
             return of_tilt_x / 12, of_radius
 
         kept, found = (moved - span, moved + span, slope), [*sums]
-        alone = [(of_light, slice(3), each) for each in zip(_away(sheet, first), seen)]
+        each_slice = zip(_away(sheet, first), seen, strict=True)
+        alone = [(of_light, slice(3), each) for each in each_slice]
         for of_kernel, planes, data in (*alone, (of_ends, slice(3, 5), (shares, seen))):
             # Kept in memory; and apart for each kernel, or all would share what covers a tap.
             operands = kept, sheet, *data, found
