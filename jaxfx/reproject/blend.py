@@ -35,7 +35,7 @@ from jaxfx.reproject.view import trace_with_angle
 _STRIDE = 8
 # Rays that an accelerator traces at once, of all cameras together. Each takes some 150 bytes
 # until its pixel is blended; with fewer rays at a time there are more launches.
-_RAYS_AT_ONCE = 700_000
+_RAYS_AT_ONCE = 2**20
 # Rays. The length of a part is a multiple of this: of odd lengths XLA makes more kernels.
 _LANES = 128
 

@@ -57,9 +57,10 @@ def with_adjoint(
         return call
 
     programs = cpu, accelerator or cpu
-    forward, tangent, adjoint, recorded = (
+    both: list[Any] = [
         None if parts[0] is None else mapped(*parts) for parts in zip(*programs, strict=True)
-    )
+    ]
+    forward, tangent, adjoint, recorded = both
 
     @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
     def kernel(reach: Any, planes: Planes) -> Array:

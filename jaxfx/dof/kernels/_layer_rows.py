@@ -305,7 +305,7 @@ def _read_back(
             )
             return windows(windows(near, -2, rows), -1, taps)
 
-        of_sprite = lambda value, planes: sum(map(jnp.multiply, value, planes))
+        of_sprite = lambda value, planes: ft.reduce(jnp.add, map(jnp.multiply, value, planes))
 
         def of_light(kept, sheet, away, seen):
             """The cotangents of value, of the tilt along y and of the place."""
