@@ -36,8 +36,6 @@ _STRIDE = 8
 # Rays that an accelerator traces at once, of all cameras together. Each takes some 150 bytes
 # until its pixel is blended; with fewer rays at a time there are more launches.
 _RAYS_AT_ONCE = 2**20
-# Rays. The length of a part is a multiple of this: of odd lengths XLA makes more kernels.
-_LANES = 128
 
 
 @on_any_mesh
@@ -136,7 +134,7 @@ def _blended(
         parts = -(-len(images) * len(pixels) // _RAYS_AT_ONCE)
         if parts <= 1:
             return blended(pixels)
-        each = -(-len(pixels) // (parts * _LANES)) * _LANES
+        each = -(-len(pixels) // parts)
         filled = jnp.pad(pixels, ((0, parts * each - len(pixels)), (0, 0)), mode="edge")
         found = jax.lax.map(blended, filled.reshape(parts, each, 2))
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(pixels)], found)
