@@ -83,6 +83,29 @@ def of_batches(
     return unbatched
 
 
+def one_direction_at_a_time(tangent: Callable[..., Any]) -> Callable[..., Any]:
+    """`tangent(static, point, direction)`, of which a batch of directions takes one's memory.
+
+    The derivatives of one image in several parameters are computed one after the other; of
+    several images, each in its own direction, all together.
+    """
+    return lambda static, *operands: _of_directions(ft.partial(tangent, static))(*operands)
+
+
+def _of_directions(tangent: Callable[..., Any]) -> Callable[..., Any]:
+    of_one = custom_vmap(tangent)
+
+    @of_one.def_vmap
+    def batch(_size, is_batched, *operands):
+        if any(jax.tree.leaves(is_batched[0])):
+            out = _of_directions(_at_once(tangent, is_batched))(*operands)
+        else:
+            out = _in_turn(of_one, is_batched)(*operands)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return of_one
+
+
 def either(
     predicate: Callable[..., Bool[Array, ""]],
     short: Callable[..., Any],

@@ -47,8 +47,10 @@ TRANSFORMS = {
     "value": lambda call: call,
     "gradient": lambda call: jax.grad(lambda *data: jnp.sum(call(*data) ** 2), (0, 1, 2)),
     "tangent": lambda call: lambda *data: jax.jvp(call, data, data)[1],
+    "jacobian": lambda call: jax.jacfwd(call, 2),
     "batch": lambda call: jax.vmap(call, (0, 0, None)),
     "batch of batches": lambda call: jax.vmap(jax.vmap(call, (0, None, None)), (None, 0, 0)),
+    "jacobian of a batch": lambda call: TRANSFORMS["jacobian"](TRANSFORMS["batch"](call)),
     "gradient of a batch": lambda call: TRANSFORMS["gradient"](TRANSFORMS["batch"](call)),
 }
 

@@ -229,7 +229,7 @@ def _blurred(image, depth, lens, gamma, epsilon, missing, max_coc, programs, cov
 @ft.cache
 def _program(cpu: str, accelerator: str) -> Callable[[int, Planes], Array]:
     """The sums by program `cpu` if lowered for a CPU, by `accelerator` elsewhere."""
-    return with_adjoint(*_PROGRAMS[cpu], plain, _PROGRAMS[accelerator])
+    return with_adjoint(_PROGRAMS[cpu], plain, _PROGRAMS[accelerator])
 
 
 @jax.custom_jvp

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._loops import fori_loop, scan
 from jaxfx._numerics import safe_divide
+from jaxfx._platform import by_platform
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, not_before_start
 
 
@@ -57,7 +58,8 @@ class Patch(NamedTuple):
     def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
         """The weighted mean of each channel: ray channel.
 
-        `scan` stores the stencil. Without it, XLA would fuse the search into each channel.
+        On a CPU `scan` stores the stencil. Without it, XLA would fuse the search into each
+        channel. On an accelerator the weights are stored, and all is read at once.
         """
 
         def add(sums: tuple[Array, Array], texel: tuple[Array, Array, Array]) -> Any:
@@ -67,10 +69,19 @@ class Patch(NamedTuple):
             weight = jnp.broadcast_to(weight[:, None], color.shape)
             return (total + weight * _unless_unusable(color, weight), weight_sum), None
 
+        def at_once(sums: tuple[Array, Array], *texels: Array) -> tuple[Array, Array]:
+            rows, columns, weights = texels
+            weights = jax.lax.optimization_barrier(weights)
+            for texel in zip(rows, columns, weights, strict=True):
+                sums, _ = add(sums, texel)
+            return sums
+
         weights = self.weights.astype(image.dtype)
         total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
         sums = total, jnp.zeros_like(weights[0])
-        (total, weight_sum), _ = scan(add, sums, (self.rows, self.columns, weights))
+        in_turn = lambda sums, *texels: scan(add, sums, texels)[0]
+        operands = sums, self.rows, self.columns, weights
+        total, weight_sum = by_platform(*operands, cpu=in_turn, accelerator=at_once)
         return safe_divide(total, jnp.broadcast_to(weight_sum[:, None], total.shape))
 
 

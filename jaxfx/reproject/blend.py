@@ -1,5 +1,6 @@
 """Views out of several cameras: blend them, or choose those that are worth it."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,6 +33,9 @@ from jaxfx.reproject.view import trace_with_angle
 # Pixels. `choose` traces one ray for each square of this side. A larger one is cheaper, and may
 # overlook what a camera shows in places smaller than it; `worth` is then a coarser mean.
 _STRIDE = 8
+# Rays that an accelerator traces at once, of all cameras together. Each takes some 150 bytes
+# until its pixel is blended; with fewer rays at a time there are more launches.
+_RAYS_AT_ONCE = 2**20
 
 
 @on_any_mesh
@@ -108,20 +112,35 @@ def _blended(
     `size` is height and width of the result in pixels, `options` are those of `trace_pixels`.
     """
 
-    def warped(image: Array, depth: Array, camera: PinholeCamera) -> tuple[Array, ...]:
+    def warped(pixels: Array, image: Array, depth: Array, camera: PinholeCamera) -> tuple:
         view, cosine, target_depth = trace_with_angle(depth, camera, target, pixels, **options)
         colors = view.patch.read_colors(image).astype(images[0].dtype)
         return colors, view.mask, cosine, target_depth
 
-    colors, mask, cosine, target_depth = _over_cameras(warped, images, depths, cameras)
-    nearest = jnp.min(jnp.where(mask, target_depth, jnp.inf), axis=0)
-    is_in_front = mask & (target_depth <= (1 + options["hole_threshold"]) * nearest[None])
-    weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0))[..., None]
-    weight = weight.astype(colors.dtype)
-    total = sum_planes(jnp.where(weight > 0, colors, 0) * weight)
-    weight_sum = jnp.broadcast_to(sum_planes(weight), total.shape)
-    alpha = (weight_sum[:, 0] > 0).astype(total.dtype)
-    return safe_divide(total, weight_sum).reshape(*size, -1), alpha.reshape(size)
+    def blended(pixels: Array) -> tuple[Array, Array]:
+        of_source = functools.partial(warped, pixels)
+        found = _over_cameras(of_source, images, depths, cameras)
+        colors, mask, cosine, target_depth = found
+        nearest = jnp.min(jnp.where(mask, target_depth, jnp.inf), axis=0)
+        is_in_front = mask & (target_depth <= (1 + options["hole_threshold"]) * nearest[None])
+        weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0))[..., None]
+        weight = weight.astype(colors.dtype)
+        total = sum_planes(jnp.where(weight > 0, colors, 0) * weight)
+        weight_sum = jnp.broadcast_to(sum_planes(weight), total.shape)
+        alpha = (weight_sum[:, 0] > 0).astype(total.dtype)
+        return safe_divide(total, weight_sum), alpha
+
+    def in_parts(pixels: Array) -> tuple[Array, Array]:
+        parts = -(-len(images) * len(pixels) // _RAYS_AT_ONCE)
+        if parts <= 1:
+            return blended(pixels)
+        each = -(-len(pixels) // parts)
+        filled = jnp.pad(pixels, ((0, parts * each - len(pixels)), (0, 0)), mode="edge")
+        found = jax.lax.map(blended, filled.reshape(parts, each, 2))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(pixels)], found)
+
+    image, alpha = by_platform(pixels, cpu=blended, accelerator=in_parts)
+    return image.reshape(*size, -1), alpha.reshape(size)
 
 
 @on_any_mesh

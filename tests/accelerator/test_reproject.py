@@ -1,9 +1,13 @@
 """Reprojection, as accelerators compute it: all rays in step, all sources at once."""
 
+import importlib
+
+import jax
 import numpy as np
 import pytest
 
 from benchmarks.scenes.reproject import run
+from jaxfx import PinholeCamera, reproject
 from tests.cases.reproject import awkward_rays, field
 from tests.reproject.test_blend import (  # noqa: F401
     test_the_choice_is_what_shows_most_and_then_what_it_lacks,
@@ -30,3 +34,24 @@ def test_every_ray_meets_what_a_walk_over_every_texel_meets(shape):
     hit = run(depth, origin, direction)
     assert not hit.exhausted.any()
     assert check_exact(hit, depth, origin, direction, 1e-9) > 0
+
+
+def test_parts_of_a_target_are_blended_as_each_source_is_warped(monkeypatch):
+    """In parts of which none is as long as a row, and the last is not full."""
+    monkeypatch.setattr(importlib.import_module("jaxfx.reproject.blend"), "_RAYS_AT_ONCE", 27)
+    rng = np.random.default_rng(0)
+    depth, image = rng.uniform(2, 2.1, (9, 11)), rng.random((9, 11, 3))
+    there, pose = PinholeCamera.from_fov(0.9, height=9, width=11), np.eye(4)
+    pose[0, 3] = 0.2
+    target = PinholeCamera.from_fov(0.9, height=9, width=11, world_from_camera=pose)
+    # Of two images with one camera the mean is seen.
+    sources = [image, 3 * image], [depth, depth], [there, there]
+    drawn, alpha = jax.jit(reproject.blend)(*sources, target)
+    expected, mask = reproject.warp(2 * image, depth, there, target)
+    np.testing.assert_array_equal(alpha, mask)
+    assert 0 < alpha.mean() < 1
+    np.testing.assert_allclose(drawn, expected, atol=1e-12)
+    blend = lambda depth: reproject.blend(sources[0], [depth] * 2, sources[2], target)
+    slope = jax.grad(lambda depth: blend(depth)[0].sum())
+    same = jax.grad(lambda depth: reproject.warp(2 * image, depth, there, target)[0].sum())
+    np.testing.assert_allclose(slope(depth), same(depth), atol=1e-9)

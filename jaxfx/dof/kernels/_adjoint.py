@@ -5,9 +5,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxfx._linear import linear
+from jaxfx._loops import varying_as
 from jaxfx._platform import one_by_one_on_cpu
 
 
@@ -15,30 +17,32 @@ Planes = TypeVar("Planes", bound=Any)
 
 
 class Program(NamedTuple):
-    """A program for a kernel: functions of the static reach of sprites and of planes."""
+    """A program for a kernel: functions of the static reach of sprites and of planes.
+
+    - `forward(reach, planes)`: the sums.
+    - `tangent(reach, planes, dot)`: their derivative along `dot`.
+    - `adjoint(reach, planes, bar)`: the transpose of that.
+    - `recorded(reach, planes)`: the sums and a record of them, arrays of floats, which
+      `adjoint` then takes as a fourth argument. None where it needs no record.
+    """
 
     forward: Callable[[Any, Any], Array]
     tangent: Callable[[Any, Any, Any], Array]
-    adjoint: Callable[[Any, Any, Array], Any]
+    adjoint: Callable[..., Any]
+    recorded: Callable[[Any, Any], tuple[Array, Any]] | None = None
 
 
 def with_adjoint(
-    forward: Callable[[Any, Planes], Array],
-    tangent: Callable[[Any, Planes, Planes], Array],
-    adjoint: Callable[[Any, Planes, Array], Planes],
-    plain: Callable[[Any, Planes], Array],
-    accelerator: Program | None = None,
+    cpu: Program, plain: Callable[[Any, Planes], Array], accelerator: Program | None = None
 ) -> Callable[[Any, Planes], Array]:
-    """`forward(reach, planes)`, to be mapped and differentiated, in both modes and again.
+    """`cpu.forward(reach, planes)`, to be mapped and differentiated, in both modes and again.
 
     - `reach`: static; how far sprites reach, in pixels or as the kernel states it.
     - `planes`: sprites as a named tuple of arrays, in which `value` has the result's shape.
-    - `tangent(reach, planes, dot)`: its derivative along `dot`.
-    - `adjoint(reach, planes, bar)`: the transpose of that.
     - `plain(reach, planes)`: the same function as JAX itself can differentiate it. Second
       derivatives take theirs from it.
-    - `accelerator`: the first three where the program is lowered for something else than a CPU;
-      the same if it is left out.
+    - `accelerator`: the program where it is lowered for something else than a CPU; the same if
+      it is left out. Both record, or neither.
 
     On a CPU a batch is worked through one by one, so that it costs what its members do.
     """
@@ -52,22 +56,42 @@ def with_adjoint(
 
         return call
 
-    cpu = forward, tangent, adjoint
-    forward, tangent, adjoint = map(mapped, cpu, accelerator or cpu)
+    programs = cpu, accelerator or cpu
+    both: list[Any] = [
+        None if parts[0] is None else mapped(*parts) for parts in zip(*programs, strict=True)
+    ]
+    forward, tangent, adjoint, recorded = both
 
     @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
     def kernel(reach: Any, planes: Planes) -> Array:
         return forward(reach, planes)
 
-    @kernel.defjvp
-    def _(reach: Any, primals: Any, tangents: Any) -> tuple[Array, Array]:
-        (planes,), (dot,) = primals, tangents
+    @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
+    def with_record(reach: Any, planes: Planes) -> tuple[Array, Any]:
+        return (kernel(reach, planes), ()) if recorded is None else recorded(reach, planes)
+
+    def value_and_tangent(reach, planes, dot):
+        out, record = with_record(reach, planes)
         push = ft.partial(tangent, reach, planes)
-        pull = ft.partial(adjoint, reach, planes)
+
+        def pull(bar):
+            return adjoint(reach, planes, bar, *(() if recorded is None else (record,)))
 
         def derivative(dot):
             return jax.jvp(ft.partial(plain, reach), (planes,), (dot,))[1]
 
-        return kernel(reach, planes), linear(push, pull, derivative, dot)
+        return (out, record), linear(push, pull, derivative, dot)
+
+    @kernel.defjvp
+    def _(reach: Any, primals: Any, tangents: Any) -> tuple[Array, Array]:
+        (out, _), out_dot = value_and_tangent(reach, *primals, *tangents)
+        return out, out_dot
+
+    @with_record.defjvp
+    def _(reach: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+        (out, record), out_dot = value_and_tangent(reach, *primals, *tangents)
+        # What the record has to do with the planes, `derivative` knows.
+        zeros = varying_as(record, jax.tree.map(jnp.zeros_like, record))
+        return (out, record), (out_dot, zeros)
 
     return kernel

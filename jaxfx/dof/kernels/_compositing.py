@@ -5,9 +5,9 @@ takes as much of the lens as is left; what lies behind a full lens is hidden. Th
 slice takes gets the fallback colour: a mean of the slices, each weighted by how full the lens
 was when it was added.
 
-The adjoint does not store the slices. Per pixel it knows the number of the slice that filled
-the lens, its colour, and the fraction of it that found room. A slice in front of that one is
-added in full, and the room that it takes is lost to the slice that fills the lens.
+The adjoint does not store the slices. Per pixel a record holds the number of the slice that
+filled the lens, its colour, and the fraction of it that found room. A slice in front of that
+one is added in full, and the room that it takes is lost to the slice that fills the lens.
 """
 
 from typing import NamedTuple
@@ -60,6 +60,27 @@ def nothing_filled(extent: Extent, sheets: Sheets) -> Filling:
     return Filling(nothing, nothing, jnp.full(shape, _NEVER), nothing, zero)
 
 
+class Record(NamedTuple):
+    """What the adjoint needs of a compositing.
+
+    - `sums`: `light` and `late`, concatenated.
+    - `last`, `arrived`, `part`: those of `Filling`, the first as a float.
+    """
+
+    sums: Float[Array, "twice_value height width"]
+    last: Plane
+    arrived: Stack
+    part: Plane
+
+
+def recorded(filling: Filling) -> tuple[Float[Array, "twice_value height width"], Record]:
+    """The sums, and the record of them."""
+    sums = jnp.concatenate([filling.light, filling.late])
+    # A float counts slices exactly, and `_NEVER` is a power of two.
+    last = filling.last.astype(sums.dtype)
+    return sums, Record(sums, last, filling.arrived, filling.part)
+
+
 def fill(index: Int[Array, ""], arriving: Stack, state: Filling) -> Filling:
     """The accumulator after one more slice."""
     light, late, allowed, full = lit(arriving, state.light, state.late)
@@ -103,6 +124,7 @@ def allowance(
 class Reading(NamedTuple):
     """Values per pixel that the adjoint reads at every slice.
 
+    - `last`, `part`: those of `Filling`.
     - `bar`, `late_bar`: the cotangents of `light` and of `late`.
     - `weight`: that of the slice that filled the lens, in the fallback colour.
     - `worth`: the derivative of the loss with respect to the share of the lens that this slice
@@ -110,7 +132,8 @@ class Reading(NamedTuple):
     - `start`: the carry of `read_slice` for the first slice.
     """
 
-    filling: Filling
+    last: Int[Array, "height width"]
+    part: Plane
     bar: Stack
     late_bar: Stack
     weight: Plane
@@ -118,20 +141,22 @@ class Reading(NamedTuple):
     start: tuple[Plane, Plane]
 
 
-def begin_reading(filling: Filling, bar: Float[Array, "twice_value height width"]) -> Reading:
-    """What `read_slice` needs; `bar` is the cotangent of `light` and `late`, concatenated."""
+def begin_reading(record: Record, bar: Float[Array, "twice_value height width"]) -> Reading:
+    """What `read_slice` needs; `bar` is the cotangent of the sums."""
     bar, late_bar = jnp.split(bar, 2)
+    light, _ = jnp.split(record.sums, 2)
     # The slice that fills a lens adds its mean colour times the room that was left.
-    arrived, part = filling.arrived, filling.part
+    arrived, part = record.arrived, record.part
     color = arrived / jnp.where(part > 0, arrived[-1], 1)[None]
     room = part * arrived[-1]
-    weight = filling.light[-1] - room / 2 + _FIRST
+    weight = light[-1] - room / 2 + _FIRST
     late_worth = sum_planes(late_bar * color)
     worth = sum_planes(bar * color) + weight * late_worth
     # A slice in front leaves less room to that one, and increases the weights in the fallback
     # colour of all slices behind. `ahead` is the derivative of the loss through those weights.
-    ahead = sum_planes(late_bar * filling.light) - room * late_worth / 2
-    return Reading(filling, bar, late_bar, weight, worth, (jnp.zeros_like(part), ahead))
+    ahead = sum_planes(late_bar * light) - room * late_worth / 2
+    start = jnp.zeros_like(part), ahead
+    return Reading(record.last.astype(int), part, bar, late_bar, weight, worth, start)
 
 
 def read_slice(
@@ -143,13 +168,13 @@ def read_slice(
     fallback weights of all slices behind.
     """
     filled, ahead = state
-    filling, bar, late_bar, weight_last, worth, _ = reading
-    before, last = index < filling.last, index == filling.last
+    last, part, bar, late_bar, weight_last, worth, _ = reading
+    before, is_last = index < last, index == last
     late = sum_planes(late_bar * arriving)
     weight = jnp.where(before, filled + arriving[-1] / 2 + _FIRST, weight_last)
     added_bar = bar + weight[None] * late_bar
     added_bar = added_bar.at[-1].add(jnp.where(before, ahead - late / 2, 0) - worth)
-    allowed = jnp.where(before, 1, jnp.where(last, filling.part, 0))
+    allowed = jnp.where(before, 1, jnp.where(is_last, part, 0))
     if_before = lambda x: jnp.where(before, x, 0)
     carry = filled + if_before(arriving[-1]), ahead - if_before(late)
     return allowed[None] * added_bar, carry

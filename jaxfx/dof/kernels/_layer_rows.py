@@ -11,7 +11,6 @@ every slice of the group, whatever the image holds.
 """
 
 import functools as ft
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,14 +21,16 @@ from jaxtyping import Array, Float, Int, Num
 
 from jaxfx._loops import fori_loop
 from jaxfx._numerics import clip01
+from jaxfx._platform import one_direction_at_a_time
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._compositing import (
-    Filling,
+    Record,
     begin_reading,
     fill,
     lit,
     nothing_filled,
     read_slice,
+    recorded,
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
 from jaxfx.dof.kernels._taps import inside
@@ -40,9 +41,14 @@ from jaxfx.dof.sprites import segment_integral
 # Slices per group: their sums stay in registers. With more, the coverage of a tap is computed
 # for fewer groups, but the sums take more memory.
 GROUP = 3
+# Pixels. A reach up to this is not made shorter for slices near the focus: that would save
+# less time than a further program takes to compile.
+_SHORT = 8
 # The most rows of offsets at a time. More are fewer launches, but where each sprite's span ends
 # is kept for every one of them.
 ROWS = 8
+# The same of the adjoint, which keeps more for each row.
+_ROWS_BACK = 4
 
 
 @ft.partial(jax.custom_jvp)
@@ -65,28 +71,26 @@ def _(primals, tangents):
     return width, slope * tangents[0]
 
 
-def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int, int]]:
-    """Runs of like groups from the front: first slice, groups, slices per group, and reach.
+def _groups(extent: Extent, slices: int) -> list[tuple[int, int, int]]:
+    """Runs of like groups of `GROUP` slices from the front: first slice, groups, and reach.
 
     Slices near the focus reach less far. A reach is the largest, or a half, a quarter of it and
-    so on: each other one would be a program of its own to compile.
+    so on, down to `_SHORT`: each other one would be a program of its own to compile. Slices of
+    the last group that lie beyond all sprites are empty.
     """
-    total = 2 * slices + 1
-    count = -(-total // GROUP)
-    bounds = [round(k * total / count) - slices for k in range(count + 1)]
     # Largest thickness of a slice, in pixels of radius.
     thick = extent.max_coc / 2 / max(slices - 1, 1)
     runs = []
-    for low, high in itertools.pairwise(bounds):
-        needed, reach = extent.reach_of(thick * (max(-low, high - 1) + 1)), extent.reach
-        # Discs within their own pixel need a reach of 0, at which halving would never end.
-        while reach > 1 and needed <= reach // 2:
+    for first in range(-slices, slices + 1, GROUP):
+        last = first + GROUP - 1
+        needed, reach = extent.reach_of(thick * (max(-first, last) + 1)), extent.reach
+        while reach > _SHORT and needed <= reach // 2:
             reach = reach // 2
-        if runs and runs[-1][2:] == (high - low, reach):
-            first, groups, *alike = runs.pop()
-            runs.append((first, groups + 1, *alike))
+        if runs and runs[-1][2] == reach:
+            start, groups, _ = runs.pop()
+            runs.append((start, groups + 1, reach))
         else:
-            runs.append((low, 1, high - low, reach))
+            runs.append((first, 1, reach))
     return runs
 
 
@@ -108,17 +112,17 @@ def _each_group(
         if extent.slices is None:
             first = jnp.floor(sheet.place.min()).astype(int)
             slices = jnp.ceil(sheet.place.max()).astype(int) - first + 1
-            runs = [(first, -(-slices // GROUP), GROUP, extent.reach)]
+            runs = [(first, -(-slices // GROUP), extent.reach)]
         else:
             runs = _groups(extent, extent.slices)
         wide = _padded(extent, sheet)
-        for start, groups, size, reach in runs:
+        for start, groups, reach in runs:
 
-            def add_group(k, state, run=(start, size, reach), wide=wide, n=number):
-                start, size, reach = run
-                first = start + k * size
-                arriving = _arriving(extent, wide, first, size, reach, apart)
-                return visit(_cropped(extent, wide), n, first, arriving, reach, state)
+            def add_group(k, state, run=(start, reach), wide=wide, sheet=sheet, n=number):
+                start, reach = run
+                first = start + k * GROUP
+                arriving = _arriving(extent, wide, first, reach, apart)
+                return visit(sheet, n, first, arriving, reach, state)
 
             # One run after the other, or all of them would take memory at once.
             wide, state = jax.lax.optimization_barrier((wide, state))
@@ -135,25 +139,17 @@ def _padded(extent: Extent, sheet: Sheets) -> Sheets:
     return Sheets(value, jnp.where(radius > 0, radius, 1), pad(sheet.tilt), pad(sheet.place))
 
 
-def _cropped(extent: Extent, wide: Sheets) -> Sheets:
-    """The sheet of `_padded`."""
-    beside = across_of(extent.reach) - extent.reach
-    rows = wide.radius.shape[-2] - _below(extent)
-    return jax.tree.map(lambda x: x[..., :rows, beside : x.shape[-1] - beside], wide)
-
-
 def _below(extent: Extent) -> int:
     """The most rows of offsets that only fill up a turn."""
     return 2 * in_turns(2 * extent.reach + 1, ROWS)[0]
 
 
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
-@ft.partial(jax.jit, static_argnames=("extent", "count", "reach", "apart"))
+@ft.partial(jax.jit, static_argnames=("extent", "reach", "apart"))
 def _arriving(
     extent: Extent,
     sheet: Sheets,
     first: Int[Array, ""],
-    count: int,
     reach: int,
     apart: bool,
 ) -> Float[Array, "slice value height width"]:
@@ -161,7 +157,7 @@ def _arriving(
 
     `sheet` is one of `_padded`, `apart` as `_each_group` has it.
     """
-    slices, planes = (1, 2) if apart else (count, AT_ONCE)
+    slices, planes = (1, 2) if apart else (GROUP, AT_ONCE)
     across, dtype = across_of(reach), sheet.radius.dtype
     (turns, rows), columns = in_turns(2 * reach + 1, ROWS), 2 * across + 1
     above, beside = extent.reach - reach, across_of(extent.reach) - across
@@ -189,7 +185,7 @@ def _arriving(
         ends, added = (moved - span, moved + span), []
         for k in range(0, values, planes):
             of_slices = []
-            for first_slice in range(0, count, slices):
+            for first_slice in range(0, GROUP, slices):
                 # Kept in memory; apart for each kernel, or all would share what covers a tap.
                 ends = jax.lax.optimization_barrier(ends)
                 start, end = (windows(x, -1, columns) for x in ends)
@@ -201,31 +197,33 @@ def _arriving(
                 terms = [weight * x for weight in weights for x in light]
                 of_slices += summed(terms, (0, 2))
             found = jnp.stack(of_slices)
-            added.append(found.reshape(count, -1, height, width))
+            added.append(found.reshape(GROUP, -1, height, width))
         return sums + jnp.concatenate(added, axis=1)
 
     # Made here, or those of all groups would be made at once.
-    shares, zero = share_of(_away(sheet, first, count)), jnp.zeros((), dtype)
+    shares, zero = share_of(_away(sheet, first)), jnp.zeros((), dtype)
     sheet, shares, zero = jax.lax.optimization_barrier((sheet, shares, zero))
-    nothing = jnp.broadcast_to(zero, (count, values, height, width))
+    nothing = jnp.broadcast_to(zero, (GROUP, values, height, width))
     return fori_loop(0, turns, turn, nothing)
 
 
-def _away(
-    sheet: Sheets, first: Int[Array, ""], count: int
-) -> Float[Array, "slice rows columns"]:
+def _away(sheet: Sheets, first: Int[Array, ""]) -> Float[Array, "slice rows columns"]:
     """How many slices each sprite lies behind each slice of a group."""
-    slices = first + jnp.arange(count)
+    slices = first + jnp.arange(GROUP)
     return sheet.place[None] - slices.astype(sheet.place.dtype)[:, None, None]
 
 
-def _filled(extent: Extent, sheets: Sheets) -> Filling:
+def record(
+    extent: Extent, sheets: Sheets
+) -> tuple[Float[Array, "twice_value height width"], Record]:
+    """The result of `forward`, and what `adjoint` needs of it."""
+
     def add(_sheet, number, first, arriving, _reach, state):
         for k, each in enumerate(arriving):
             state = fill(number * APART + first + k, each, state)
         return state
 
-    return _each_group(extent, sheets, add, nothing_filled(extent, sheets))
+    return recorded(_each_group(extent, sheets, add, nothing_filled(extent, sheets)))
 
 
 def forward(
@@ -251,10 +249,13 @@ def tangent(
 
 
 def adjoint(
-    extent: Extent, sheets: Sheets, bar: Float[Array, "twice_value height width"]
+    extent: Extent,
+    sheets: Sheets,
+    bar: Float[Array, "twice_value height width"],
+    record: Record,
 ) -> Sheets:
     """The transpose of `tangent`."""
-    reading = begin_reading(_filled(extent, sheets), bar)
+    reading = begin_reading(record, bar)
 
     def read(sheet, number, first, arriving, reach, state):
         bars, carry = state
@@ -262,7 +263,7 @@ def adjoint(
         for k, each in enumerate(arriving):
             bar, carry = read_slice(reading, number * APART + first + k, each, carry)
             seen.append(bar)
-        found = _read_back(extent, sheet, first, reach, jnp.stack(seen))
+        found = _read_back(extent, sheet, first, reach, seen)
         bars = jax.tree.map(lambda x, y: x.at[number].add(y), bars, found)
         return bars, carry
 
@@ -276,75 +277,85 @@ def _read_back(
     sheet: Sheets,
     first: Int[Array, ""],
     reach: int,
-    bar: Float[Array, "slice value height width"],
+    bars: list[Float[Array, "value height width"]],
 ) -> Sheets:
-    """The adjoint of `_arriving` at `bar`."""
+    """The adjoint of `_arriving` at `bars`, one for each slice of the group."""
     far, across = extent.reach, across_of(reach)
-    (turns, rows), taps = in_turns(2 * reach + 1, ROWS), 2 * across + 1
+    (turns, rows), taps = in_turns(2 * reach + 1, _ROWS_BACK), 2 * across + 1
     high, wide = sheet.radius.shape
-    away = _away(sheet, first, len(bar))
-    value, dtype = sheet.value, sheet.value.dtype
-    sheet, shares, slopes = jax.lax.optimization_barrier(
-        (sheet, share_of(away), share_slope_of(away))
-    )
+    dtype = sheet.value.dtype
     below = far + turns * rows - reach - 1
-    pad = [(0, 0), (0, 0), (far + reach, below), (far + across, far + across)]
-    seen = jnp.pad(bar, pad)
+    pad = [(0, 0), (far + reach, below), (far + across, far + across)]
     edge = jnp.asarray(across + 0.5 - np.arange(taps)[None, None, :, None], dtype)
     at_pixel = lambda x: x[None, :, None]
+    # Kept in memory.
+    operands = sheet, share_of(_away(sheet, first)), [jnp.pad(bar, pad) for bar in bars]
+    sheet, shares, seen = jax.lax.optimization_barrier(operands)
 
     def turn(index, sums):
         row = (index * rows - reach + jnp.arange(rows)).astype(dtype)
         widths = jax.vmap(ft.partial(_half_width_and_slope, slope=True), (None, 0))
         span, slope = widths(sheet.radius, row)
         moved = sheet.tilt[:1] * span * span / 3
-        near = jax.lax.dynamic_slice_in_dim(
-            seen, index * rows, high + rows - 1, axis=-2, allow_negative_indices=False
-        )
-        kept, added = (moved - span, moved + span, slope, near), []
         row = row[:, None, None, None]
 
-        def terms_of(kind, kept, sheet, shares, slopes):
-            start, end, slope = (x[:, :, None] for x in kept[:3])
-            there = windows(windows(kept[3], -2, rows), -1, taps)
-            end_in, start_in = end + edge, start + edge
-            cover = clip01(end_in) - clip01(start_in)
-            tilt_x, facing = at_pixel(sheet.tilt[0]), 1 + at_pixel(sheet.tilt[1]) * row
+        def there(x):
+            near = jax.lax.dynamic_slice_in_dim(
+                x, index * rows, high + rows - 1, axis=-2, allow_negative_indices=False
+            )
+            return windows(windows(near, -2, rows), -1, taps)
 
-            def over_slices(weights, k):
-                return sum(at_pixel(w) * x[k] for w, x in zip(weights, there, strict=True))
+        of_sprite = lambda value, planes: ft.reduce(jnp.add, map(jnp.multiply, value, planes))
 
-            def of_sprite(weights):
-                values = enumerate(sheet.value)
-                return sum(at_pixel(x) * over_slices(weights, k) for k, x in values)
+        def of_light(kept, sheet, away, seen):
+            """The cotangents of value, of the tilt along y and of the place."""
+            start, end = (x[:, :, None] + edge for x in kept[:2])
+            cover = clip01(end) - clip01(start)
+            covered = [cover * x for x in there(seen)]
+            # Of all rows, two sums tell what a tilt along y weights them by.
+            found = summed([term for x in covered for term in (x, row * x)], (0, 2))
+            level, by_row = found[::2], found[1::2]
+            tilted = [x + sheet.tilt[1] * y for x, y in zip(level, by_row, strict=True)]
+            share = share_of(away)
+            of_tilt_y = share * of_sprite(sheet.value, by_row)
+            of_place = share_slope_of(away) * of_sprite(sheet.value, tilted)
+            return share[None] * jnp.stack(tilted), of_tilt_y, of_place
 
-            if kind == "value":
-                ks = range(len(value))
-                return [facing * cover * over_slices(shares, k) for k in ks]
-            if kind == "tilt_y, place":
-                return [row * cover * of_sprite(shares), facing * cover * of_sprite(slopes)]
-            # Where an end lies: no other pixel changes with it.
-            span, worth = (end - start) / 2, facing * of_sprite(shares)
-            moved = worth * (inside(end_in) - inside(start_in))
-            grown = worth * (inside(end_in) + inside(start_in))
-            of_radius = slope * (grown + moved * tilt_x * span * (2 / 3))
-            return [moved * span * span / 3, of_radius]
+        def of_ends(kept, sheet, shares, seen):
+            """The cotangents of the tilt along x and of the radius: both move the ends."""
+            start, end, slope = (x[:, :, None] for x in kept)
+            at_end, at_start = inside(end + edge), inside(start + edge)
+            value = [*map(at_pixel, sheet.value)]
+            light = of_sprite(map(at_pixel, shares), [of_sprite(value, there(x)) for x in seen])
+            # Both ends are moved by a third of the tilt times half their distance squared.
+            distance, third = end - start, at_pixel(sheet.tilt[0] / 3)
+            facing = 1 + at_pixel(sheet.tilt[1]) * row
+            moved = facing * (at_end - at_start) * distance
+            grown = slope * (facing * (at_end + at_start) + moved * third)
+            of_tilt_x, of_radius = summed([moved * distance, grown], (0, 2), light)
+            return of_tilt_x / 12, of_radius
 
-        groups = [("value", k) for k in range(0, len(value), AT_ONCE)]
-        for kind, k in [*groups, ("tilt_y, place", 0), ("tilt_x, radius", 0)]:
+        kept, found = (moved - span, moved + span, slope), [*sums]
+        each_slice = zip(_away(sheet, first), seen, strict=True)
+        alone = [(of_light, slice(3), each) for each in each_slice]
+        for of_kernel, planes, data in (*alone, (of_ends, slice(3, 5), (shares, seen))):
             # Kept in memory; and apart for each kernel, or all would share what covers a tap.
-            kept, *own = jax.lax.optimization_barrier((kept, sheet, shares, slopes))
-            terms = terms_of(kind, kept, *own)
-            added += summed(terms[k : k + AT_ONCE], (0, 2))
-        return sums + jnp.stack(added)
+            operands = kept, sheet, *data, found
+            kept, *of_taps, found = jax.lax.optimization_barrier(operands)
+            found[planes] = map(jnp.add, found[planes], of_kernel(kept, *of_taps))
+        return found
 
-    nothing = jnp.zeros((len(value) + 4, high, wide), dtype)
-    sums = fori_loop(0, turns, turn, nothing)
-    *of_value, of_tilt_y, of_place, of_tilt_x, of_radius = sums
-    tilt = jnp.stack([of_tilt_x, of_tilt_y])
-    found = Sheets(jnp.stack(of_value), of_radius, tilt, of_place)
+    zero = jnp.zeros((high, wide), dtype)
+    sums = [jnp.zeros_like(sheet.value), *[zero] * 4]
+    of_value, of_tilt_y, of_place, of_tilt_x, of_radius = fori_loop(0, turns, turn, sums)
+    found = Sheets(of_value, of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)
     # As forward has it: what is not let through passes no derivative.
-    return jax.tree.map(lambda x: jnp.where(value[-1] > 0, x, 0), found)
+    return jax.tree.map(lambda x: jnp.where(sheet.value[-1] > 0, x, 0), found)
 
 
-SHEET_ROWS = Program(*map(together, (forward, tangent, adjoint)))
+SHEET_ROWS = Program(
+    together(forward),
+    one_direction_at_a_time(together(tangent)),
+    together(adjoint),
+    together(record),
+)

@@ -12,14 +12,16 @@ from jaxtyping import Array, Float
 from jaxfx._loops import cond, scan
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
-from jaxfx.dof.kernels._adjoint import with_adjoint
+from jaxfx.dof.kernels._adjoint import Program, with_adjoint
 from jaxfx.dof.kernels._compositing import (
     Filling,
+    Record,
     allowance,
     begin_reading,
     fill,
     nothing_filled,
     read_slice,
+    recorded,
 )
 from jaxfx.dof.kernels._layer_rows import SHEET_ROWS
 from jaxfx.dof.kernels._slices import (
@@ -46,6 +48,12 @@ def composited(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value heig
 def _forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
     filling = _filled(extent, sheets)
     return jnp.concatenate([filling.light, filling.late])
+
+
+def _recorded(
+    extent: Extent, sheets: Sheets
+) -> tuple[Float[Array, "twice_value height width"], Record]:
+    return recorded(_filled(extent, sheets))
 
 
 def _filled(extent: Extent, sheets: Sheets) -> Filling:
@@ -83,10 +91,13 @@ def _tangent(
 
 
 def _adjoint(
-    extent: Extent, sheets: Sheets, bar: Float[Array, "twice_value height width"]
+    extent: Extent,
+    sheets: Sheets,
+    bar: Float[Array, "twice_value height width"],
+    record: Record,
 ) -> Sheets:
     grid = Grid(extent.reach, sheets)
-    reading = begin_reading(_filled(extent, sheets), bar)
+    reading = begin_reading(record, bar)
     discs = grid.discs(sheets)
 
     def read(index, is_held, state):
@@ -145,4 +156,5 @@ def plain(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height wi
     return jnp.concatenate(scan(jax.checkpoint(add), (nothing, nothing), slices)[0])
 
 
-_composited = with_adjoint(_forward, _tangent, _adjoint, plain, SHEET_ROWS)
+_BY_SPANS = Program(_forward, _tangent, _adjoint, _recorded)
+_composited = with_adjoint(_BY_SPANS, plain, SHEET_ROWS)

@@ -154,4 +154,4 @@ def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]
 
 
 SPANS = Program(_forward, _tangent, _adjoint)
-_sums = with_adjoint(*SPANS, _tiles.plain)
+_sums = with_adjoint(SPANS, _tiles.plain)

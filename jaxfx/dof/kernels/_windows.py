@@ -41,11 +41,18 @@ def windows(x: Shaped[Array, "..."], axis: int, count: int) -> Shaped[Array, "..
 
 
 def summed(
-    terms: list[Float[Array, "..."]], axes: tuple[int, ...]
+    terms: list[Float[Array, "..."]],
+    axes: tuple[int, ...],
+    factor: Float[Array, "..."] | None = None,
 ) -> list[Float[Array, "..."]]:
-    """The sum of each of some arrays of one shape over these axes, the first of even length."""
+    """The sum of each of some arrays of one shape over these axes, the first of even length.
+
+    `factor` multiplies every term; what takes long to compute is then computed once for two.
+    """
     paired = len(terms) // 2 * 2
     arrays = [*map(jax.lax.complex, terms[:paired:2], terms[1:paired:2]), *terms[paired:]]
+    if factor is not None:
+        arrays = [x * factor.astype(x.dtype) for x in arrays]
     if len(arrays) == 1:
         # The sum of a single array XLA would cut in two, one after the other.
         first, second = _summed(jnp.split(arrays[0], 2, axes[0]), axes)
