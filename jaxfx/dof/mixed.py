@@ -50,14 +50,14 @@ class Split(NamedTuple):
 def split(image: _Image, depth: _Plane, lens: Any, threshold: Array, max_coc: float) -> Split:
     """Split the pixels that are next to an edge in depth.
 
-    Their colours are `alpha * image + (1 - alpha) * behind`, exactly. An edge is where, in
-    3 x 3 pixels, the defocus differs by more than the threshold. The nearest surface there is
-    the one in front. Both have the mean colour of their pixels within 5 x 5, in which those
-    count most that are near and have few neighbours of another surface. Alpha is where the
-    pixel's colour lies between the two. It is drawn towards "not mixed" as far as the texture
-    of the pixel's own surface explains its colour (a Wiener filter), and the depth's surface
-    has at least half the pixel, since depth is that of its middle. What remains of the colour
-    is shared out by the least change of both.
+    Their colours are `alpha * image + (1 - alpha) * behind`, exactly. An edge is where the
+    defocus of one of 8 neighbours differs from the pixel's by more than the threshold. The
+    nearest surface of those 9 is the one in front. Both have the mean colour of their pixels
+    within 5 x 5, in which those count most that are near and have few neighbours of another
+    surface. Alpha is where the pixel's colour lies between the two. It is drawn towards "not
+    mixed" as far as the texture of the pixel's own surface explains its colour (a Wiener
+    filter), and the depth's surface has at least half the pixel, since depth is that of its
+    middle. What remains of the colour is shared out by the least change of both.
     """
     view = defocused(image, depth, lens, max_coc)
     given, depth = view.image, depth.astype(view.image.dtype)
@@ -67,8 +67,9 @@ def split(image: _Image, depth: _Plane, lens: Any, threshold: Array, max_coc: fl
     far = jnp.where(is_known, defocus, -jnp.inf)
     front = ft.reduce(jnp.minimum, (there for *_, there in _around(near, 1, jnp.inf)))
     back = ft.reduce(jnp.maximum, (there for *_, there in _around(far, 1, -jnp.inf)))
-    is_edge = is_known & (back - front > threshold)
-    is_behind = is_edge & (defocus - front > threshold)
+    is_behind = is_known & (defocus - front > threshold)
+    # From the pixel's own, so that steep surfaces have no edges.
+    is_edge = is_behind | (is_known & (back - defocus > threshold))
 
     # Not by a power of a sum: one pass over the neighbours for both surfaces.
     lone_front, lone_back = jnp.ones_like(defocus), jnp.ones_like(defocus)

@@ -60,7 +60,7 @@ def in_a_loop(image, defocus):
             near = [defocus[p] for p in around(y, x, 1)] + [defocus[y, x]]
             first = min(near)
             is_behind = defocus[y, x] - first > 2
-            if max(near) - first <= 2:
+            if not (is_behind or max(near) - defocus[y, x] > 2):
                 continue
             found = {"front": [], "back": []}
             for v, u in around(y, x, 2):
@@ -152,6 +152,12 @@ def test_what_is_not_antialiased_is_kept():
     assert not np.any(split(image, depth).is_mixed)
     flat = np.full_like(image, 0.5)
     assert not np.any(split(flat, depth).is_mixed)
+
+
+def test_a_steep_surface_is_not_split():
+    """Its defocus changes by up to two pixels a pixel."""
+    depth = 24 / (12 - np.clip(1.9 * (np.arange(SIZE[1]) - 32), -11, 11.9))
+    assert not np.any(split(texture(8), np.broadcast_to(depth, SIZE)).is_mixed)
 
 
 def passed(left, right, radius, size=SIZE):
