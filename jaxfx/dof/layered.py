@@ -178,15 +178,16 @@ def layered(
         "layered(margin=...)", margin, is_inside, "an integer from 0, less than half the image"
     )
     pure, known = image, depth
-    parts = None
+    parts: Split | None = None
     if option("layered(mixed=...)", mixed, ("keep", "split")) == "split":
         if alpha is not None:
             raise ValueError(
                 "`layered(alpha=...)` must be left out with mixed='split', which estimates it, "
                 f"got an array of shape {jnp.shape(alpha)}."
             )
-        parts = split(image, depth, lens, threshold, max_coc)
-        pure, image, depth, alpha = parts.pure, parts.image, parts.depth, parts.alpha
+        found: Split = split(image, depth, lens, threshold, max_coc)
+        pure, image, depth, alpha = found.pure, found.image, found.depth, found.alpha
+        parts = found
         lens = compiled("layered", own, depth)
     elif alpha is not None:
         alpha = share("layered(alpha=...)", alpha, depth.shape)
