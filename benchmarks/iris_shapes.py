@@ -2,7 +2,8 @@
 
 `python -m benchmarks.iris_shapes [--out FILE.png]` renders planes with lights of 50 times white
 through a hexagonal lens, pass by pass, and prints the PSNR of each method to that, clipped to
-what a screen shows. A disc is tried around the hexagon and at its area.
+what a screen shows. A disc is tried around the hexagon and at its area. `--blades 0
+--vignetting 0.8 --profile -0.7` makes cat's eyes and soap bubbles of them.
 """
 
 import argparse
@@ -64,6 +65,8 @@ def main():
     parser.add_argument("--samples", type=int, default=6144, help="passes of the reference")
     parser.add_argument("--coc", type=float, default=24.0, help="of the wall, in pixels")
     parser.add_argument("--blades", type=int, default=6)
+    parser.add_argument("--vignetting", type=float, default=0.0)
+    parser.add_argument("--profile", type=float, default=0.0)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
 
@@ -71,7 +74,8 @@ def main():
     unit = ThinLens.from_camera(lit.camera, aperture=1.0, focus_distance=lit.DISC)
     aperture = given.coc / float(unit.circle_of_confusion(lit.WALL))
     lens = ThinLens.from_camera(lit.camera, aperture=aperture, focus_distance=lit.DISC)
-    iris = dof.Iris(given.blades, rotation=0.3)
+    rim = {"vignetting": given.vignetting, "profile": given.profile}
+    iris = dof.Iris(given.blades, rotation=0.3, **rim)
     view = jax.jit(lit.view)
     draw = lambda eye: view(eye)[0]
     options = {"samples": given.samples, "iris": iris}

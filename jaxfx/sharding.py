@@ -63,8 +63,9 @@ def rows(
       `dof`, `max_coc / 2 + 2` rounded up, 4 more for `dof.gather`; for `blur.gaussian` half
       the taps of each pass; for `shadow.pcf` 0. That is `dof.layered` with `behind=None`; with
       a second layer it sees `1.5 * max_coc + 2` rows, and `7.5 * max_coc + 9` where it guesses
-      one (`dof.peel`: at most three steps of each length of its search). With fewer rows it is
-      another image near the edges of a share, which nothing reports.
+      one (`dof.peel`: at most three steps of each length of its search); 3 more with
+      `mixed="split"`. With fewer rows it is another image near the edges of a share, which
+      nothing reports.
     - `align`: static; rows are divided at multiples of it: 4 for `dof.gather`, whose
       low-resolution image has a row for 4.
 

@@ -224,6 +224,7 @@ OWN_EXAMPLES = {
 
 # Choices that do not go together, which the function refuses by name.
 REFUSED = {
+    "dof.layered": lambda chosen: chosen["mixed"] == "split" and chosen["alpha"] is not None,
     "dof.scatter": lambda chosen: (
         (chosen["coverage"] == "indicator" and chosen["program"] != "segment_sum")
         or (chosen["iris"] is iris and chosen["program"] not in ("auto", "shift", "spans"))

@@ -2,6 +2,7 @@
 
 import functools as ft
 import math
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,18 +14,27 @@ from jaxfx._checks import (
     WholeNumber,
     check,
     is_concrete,
+    option,
     parameter,
     share,
     whole_number,
 )
 from jaxfx._meshes import on_any_mesh
 from jaxfx._xla import sum_planes
-from jaxfx.dof.arguments import OWN, Defocused, check_arguments, defocused, with_own
+from jaxfx.dof.arguments import (
+    OWN,
+    Defocused,
+    check_arguments,
+    compiled,
+    defocused,
+    with_own,
+)
 from jaxfx.dof.behind import Behind, Layer, Surface, checked, given, let_through
 from jaxfx.dof.iris import Iris, areas, check_iris, moved, outline
 from jaxfx.dof.kernels import _layer_chords
 from jaxfx.dof.kernels._layers import composited
 from jaxfx.dof.kernels._slices import SLICES, Extent, Sheets
+from jaxfx.dof.mixed import Split, split
 from jaxfx.dof.peel import peel
 from jaxfx.dof.spoiled import spoiled
 from jaxfx.dof.sprites import POINT_RADIUS
@@ -50,6 +60,7 @@ def layered(
     threshold: Float[ArrayLike, ""] | float = 2.0,
     iris: Iris | None = None,
     margin: WholeNumber = 0,
+    mixed: Literal["keep", "split"] = "keep",
 ) -> Float[Array, "rows columns channel"]:
     """Depth of field with occlusion: point sprites composited per pixel from front to back.
 
@@ -81,18 +92,23 @@ def layered(
       the same on every device, and slower.
     - `margin`: static; pixels. By so much the images that are given are larger on each side
       than what is returned, so that nothing has to be guessed there.
+    - `mixed`: static; what becomes of pixels of silhouettes that hold colours of two surfaces
+      and the depth of one. `"keep"` takes them as they are; `"split"` makes two sprites of
+      them, by an estimate of the share of each. Take `"split"` for antialiased images, such
+      as photographs, with thin things in them.
 
     **Returns:** height width channel, without the margin, in the type of `image`. A pixel whose
     colour is not a number spoils what its sprite can reach. One whose depth is missing has no
     sprite: it shows what reaches it or, where nothing does, its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
-    `threshold`, alpha outside [0, 1], an `iris` or a layer that is none, a `margin`
-    that leaves nothing, or no `max_coc` under a transform.
+    `threshold`, alpha outside [0, 1] or with `mixed="split"`, an `iris` or a layer that is
+    none, a `margin` that leaves nothing, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `alpha` (at 0 and 1 too), all of
     `behind`, `threshold` and every field of `lens` and `iris`, forward and reverse; of a
-    guessed layer, which pixels it repeats is constant. In `lens` and `depth`, zero (but for
+    guessed layer, which pixels it repeats is constant, as are the pixels of which split ones
+    take colours. In `lens` and `depth`, zero (but for
     rounding) where a circle of confusion is below a pixel or above `max_coc`: a search cannot
     leave a lens all of whose circles are so. There is no kink where neighbours have the same
     depth or a surface is in focus. Kinks remain where a radius is clamped and where a lens is
@@ -132,6 +148,12 @@ def layered(
     A guessed second layer repeats pixels from next to an edge. On 18 images of three scenes,
     those that `peel` was made on, it gains 1.08 dB on average and loses 0.01 at most.
 
+    Split pixels are those of two surfaces more than `threshold` apart, next to each other. The
+    farther of the two goes into the first layer behind. The colours of both are means of near
+    pixels, and together make the pixel's own, so that in focus nothing changes. Of antialiased
+    wires of 1 to 3 pixels it gains 1.7 to 8.4 dB, and more with `behind=["peel", "peel"]`; from
+    an image that is not antialiased it loses up to 0.6 dB, or 2.8 with two guesses.
+
     Known limits: what no layer shows is guessed from its surroundings; beyond the frame the
     last pixels are repeated, so that the border is some 3 dB worse than the inside. Through
     which part of the lens a soft matte lets light is not known: where both it and what is
@@ -155,22 +177,34 @@ def layered(
     margin = whole_number(
         "layered(margin=...)", margin, is_inside, "an integer from 0, less than half the image"
     )
-    known = depth
-    if alpha is not None:
+    pure, known = image, depth
+    parts: Split | None = None
+    if option("layered(mixed=...)", mixed, ("keep", "split")) == "split":
+        if alpha is not None:
+            raise ValueError(
+                "`layered(alpha=...)` must be left out with mixed='split', which estimates it, "
+                f"got an array of shape {jnp.shape(alpha)}."
+            )
+        found: Split = split(image, depth, lens, threshold, max_coc)
+        pure, image, depth, alpha = found.pure, found.image, found.depth, found.alpha
+        parts = found
+        lens = compiled("layered", own, depth)
+    elif alpha is not None:
         alpha = share("layered(alpha=...)", alpha, depth.shape)
         known = jnp.where(alpha < 1, 0, depth)
     layers = []
-    for layer in given("layered(behind=...)", behind):
-        guess = lambda: peel(
-            image,
-            known,
-            own,
-            max_coc=max_coc,
-            threshold=threshold,
-            behind=[x[:2] for x in layers],
-        )
-        item = guess() if isinstance(layer, str) and layer == "peel" else layer
-        layers.append(checked("layered", image, depth, own, item))
+    for item in given("layered(behind=...)", behind):
+        chosen = item
+        if isinstance(item, str) and item == "peel":
+            in_front = [x[:2] for x in layers]
+            options = {"max_coc": max_coc, "threshold": threshold, "behind": in_front}
+            chosen = peel(pure, known, own, **options)
+        layer = checked("layered", image, depth, own, chosen)
+        if parts is not None and not layers:
+            layer = checked("layered", image, depth, own, _before(parts, layer))
+        layers.append(layer)
+    if parts is not None and not layers:
+        layers = [checked("layered", image, depth, own, (parts.behind, parts.farther))]
     slices = None
     if is_concrete(threshold):
         slices = math.ceil(max_coc / max(float(threshold), max_coc / SLICES))
@@ -229,6 +263,15 @@ def _layered(first, extent, behind, threshold, iris, margin):
         late += clear * jnp.concatenate([own, jnp.ones_like(own[..., :1])], axis=-1)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
     return jnp.where(inside(spoils)[..., None], jnp.nan, result).astype(first.image.dtype)
+
+
+def _before(parts: Split, layer: Layer) -> tuple[Array, ...]:
+    """A layer behind the first, that of mixed pixels being the farther of their surfaces."""
+    image = jnp.where(parts.is_mixed[..., None], parts.behind, layer.image)
+    depth = jnp.where(parts.is_mixed, parts.farther, layer.depth)
+    if layer.alpha is None:
+        return image, depth
+    return image, depth, jnp.where(parts.is_mixed, 1, layer.alpha)
 
 
 def _seen_alone(
