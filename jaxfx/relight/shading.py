@@ -372,10 +372,9 @@ def colored(light: Light, parts: Parts) -> Parts:
     if isinstance(light, SphericalHarmonicsLight):
         return parts
     color = light.color[None, None]
-    diffuse, specular, grazing = (
-        None if part is None else color.astype(part.dtype) * part for part in parts
-    )
-    return diffuse, specular, grazing
+    times_color = lambda part: None if part is None else color.astype(part.dtype) * part
+    diffuse, specular, grazing = parts
+    return color.astype(diffuse.dtype) * diffuse, times_color(specular), times_color(grazing)
 
 
 def _on_matt(surface: Surface, irradiance: _Vectors) -> _Vectors:
