@@ -412,4 +412,5 @@ not_measured(
 
 
 # The cases of materials and of light from all around, which come last.
-import tests.cases.relight_materials  # noqa: E402, F401
+import tests.cases.relight_materials  # noqa: E402
+import tests.cases.relight_paths  # noqa: E402, F401
