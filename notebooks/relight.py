@@ -162,13 +162,18 @@ curve = lambda image: jnp.where(
     12.92 * image,
     1.055 * jnp.exp(jnp.log(jnp.clip(image, 0.0031308, 1)) / 2.4) - 0.055,
 )
-to_bytes = jax.jit(lambda image: jnp.round(255 * curve(image)).astype(jnp.uint8))
+
+
+@jax.jit
+def bytes_under(rest, light):
+    """The image with the light added, in sRGB: one program, which keeps no other state."""
+    return jnp.round(255 * curve(rest.add(light).image)).astype(jnp.uint8)
 
 
 def jpeg_under(light):
     """The image with the light added, as JPEG."""
     stream = BytesIO()
-    pixels = np.asarray(to_bytes(rest.add(light).image))
+    pixels = np.asarray(bytes_under(rest, light))
     Image.fromarray(pixels).save(stream, "JPEG", quality=85)
     return stream.getvalue()
 
