@@ -267,8 +267,9 @@ def _layered(first, extent, behind, threshold, iris, margin):
 
 def _before(parts: Split, layer: Layer) -> tuple[Array, ...]:
     """A layer behind the first, that of mixed pixels being the farther of their surfaces."""
-    image = jnp.where(parts.is_mixed[..., None], parts.behind, layer.image)
-    depth = jnp.where(parts.is_mixed, parts.farther, layer.depth)
+    behind = parts.behind.astype(layer.image.dtype)
+    image = jnp.where(parts.is_mixed[..., None], behind, layer.image)
+    depth = jnp.where(parts.is_mixed, parts.farther.astype(layer.depth.dtype), layer.depth)
     if layer.alpha is None:
         return image, depth
     return image, depth, jnp.where(parts.is_mixed, 1, layer.alpha)

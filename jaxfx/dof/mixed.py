@@ -61,6 +61,7 @@ def split(image: _Image, depth: _Plane, lens: Any, threshold: Array, max_coc: fl
     """
     view = defocused(image, depth, lens, max_coc)
     given, depth = view.image, depth.astype(view.image.dtype)
+    threshold = threshold.astype(given.dtype)
     defocus = jax.lax.stop_gradient(view.defocus)
     is_known = ~(view.missing | view.bad)
     near = jnp.where(is_known, defocus, jnp.inf)
