@@ -1,4 +1,4 @@
-"""What splitting mixed pixels gains `layered`, in decibels.
+"""PSNR of `layered` with mixed pixels kept and split, in decibels.
 
 `python -m benchmarks.mixed_pixels [MESH ...] [--out FOLDER]` prints a row for each of three
 foci and two apertures of every scene: the PSNR of `layered` to the multi-pass reference, and

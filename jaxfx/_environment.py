@@ -197,10 +197,13 @@ _ANGLE += (0.096421852, -0.055912166, 0.021862849, -0.004054538)
 
 
 def _angle(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`arctan2(y, x)` to 4e-8, of numbers that are not both 0.
+    """`arctan2(y, x)` of numbers that are not both 0: in float32 to 4e-8, its slope to 3e-5.
 
     XLA on a CPU calls the library's function number by number, which takes ten times as long.
+    Types with more digits than the polynomial get it all the same.
     """
+    if jnp.finfo(x.dtype).eps < 1e-8:
+        return jnp.arctan2(y, x)
     height, width = absolute(y), absolute(x)
     is_steep = height > width
     ratio = jnp.where(is_steep, width, height) / jnp.where(is_steep, height, width)

@@ -61,7 +61,7 @@ def nothing_filled(extent: Extent, sheets: Sheets) -> Filling:
 
 
 class Record(NamedTuple):
-    """What the adjoint needs of a compositing.
+    """Intermediate images of a compositing, kept for its adjoint.
 
     - `sums`: `light` and `late`, concatenated.
     - `last`, `arrived`, `part`: those of `Filling`, the first as a float.
@@ -142,7 +142,7 @@ class Reading(NamedTuple):
 
 
 def begin_reading(record: Record, bar: Float[Array, "twice_value height width"]) -> Reading:
-    """What `read_slice` needs; `bar` is the cotangent of the sums."""
+    """Operands of `read_slice`; `bar` is the cotangent of the sums."""
     bar, late_bar = jnp.split(bar, 2)
     light, _ = jnp.split(record.sums, 2)
     # The slice that fills a lens adds its mean colour times the room that was left.
