@@ -89,11 +89,9 @@ def find_places(
 ) -> Places:
     """The receivers' places in a map of `shape` that `pad_map` padded for `size`."""
     u, v, z, slope = (field.astype(dtype) for field in receivers)
-    # A NaN among the slopes would make the derivative with respect to the slope bias NaN.
-    is_valid = (z > 0) & jnp.isfinite(slope)
-    slope = jnp.where(is_valid, slope, 0)
-    threshold = z - (bias.astype(dtype) + slope_bias.astype(dtype) * slope)
-    threshold = jnp.where(is_valid & (threshold < jnp.inf), threshold, -jnp.inf)
+    threshold = z - (bias.astype(dtype) + _slope_offset(slope_bias.astype(dtype), slope))
+    # Of a slope that is NaN or -inf the threshold is not below inf.
+    threshold = jnp.where((z > 0) & (threshold < jnp.inf), threshold, -jnp.inf)
 
     # Receivers outside the map, and NaNs, which no comparison holds for, go to its border.
     reach = size // 2
@@ -104,6 +102,27 @@ def find_places(
     left, top = (jax.lax.stop_gradient(jnp.floor(x)) for x in (u, v))
     column, row = (x.astype(jnp.int32) + size for x in (left, top))
     return Places(row, column, threshold, u - left - 0.5, v - top - 0.5)
+
+
+@jax.custom_jvp
+def _slope_offset(
+    slope_bias: Float[Array, ""], slope: Float[Array, "*place"]
+) -> Float[Array, "*place"]:
+    """Bias by a receiver's slope, scene units.
+
+    A slope that is not finite adds nothing to the derivative, so that the one with respect to
+    `slope_bias` is finite. Only the derivative looks: for a filter of 7 x 7 texels the check
+    takes 7 % of the time, since XLA repeats it for every tap.
+    """
+    return slope_bias * slope
+
+
+@_slope_offset.defjvp
+def _(primals, tangents):
+    slope_bias, slope = primals
+    slope_bias_dot, slope_dot = tangents
+    finite = jnp.where(jnp.isfinite(slope), slope, 0)
+    return slope_bias * slope, slope_bias_dot * finite + slope_bias * slope_dot
 
 
 @ft.partial(jax.jit, static_argnames=("size", "kernel"))
