@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxfx._checks import is_concrete
 from jaxfx._loops import cond, varying_as, while_loop
 from jaxfx._progress import Bar
-from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt
+from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt, Linear, linearised
 
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -115,8 +115,7 @@ def descend(
         if done or waited >= patience or result != optx.RESULTS.successful:
             reason = result
             break
-    y = _finish(solver, fn, y, state, losses[-1], reason)
-    loss = _loss(fn, y)
+    y, loss = _finish(solver, fn, y, state, losses[-1], reason)
     if not math.isfinite(loss):
         y, loss, reason = best, _loss(fn, best), optx.RESULTS.nonlinear_divergence
     return End(y, [*losses, loss], verdict(reason))
@@ -172,8 +171,7 @@ def _descend_in_program(
     )
     first = varying_as((fn, unknowns), first)
     at = while_loop(lambda at: ~at.has_ended & (at.count < max_steps), step, first)
-    y = _finish(solver, fn, at.y, at.solver, at.losses[at.count - 1], at.reason)
-    loss = _loss(fn, y)
+    y, loss = _finish(solver, fn, at.y, at.solver, at.losses[at.count - 1], at.reason)
     diverged = ~jnp.isfinite(loss)
     y = jax.tree.map(functools.partial(jnp.where, diverged), at.best, y)
     loss = cond(diverged, lambda: _loss(fn, at.best), lambda: loss)
@@ -196,15 +194,25 @@ class _Objective(eqx.Module):
         return (loss if self.scalar else residual), loss
 
 
+def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Linear:
+    """A residual and its Jacobian, by the program of a search by our own solver."""
+    return linearised(_Objective(residual, scalar=False), unknowns, None)
+
+
 @functools.cache
 def _default_solver() -> LevenbergMarquardt:
     return LevenbergMarquardt(rtol=1e-4, atol=1e-5)
 
 
-# A solver's state holds functions, which `jit` compares by identity: a state passed to `jit` as
-# it is would compile every search again. Only its arrays leave a compiled function, and go back
-# into a state that is built inside the next one, so that all searches share one program.
+# The state of another solver holds functions, which `jit` compares by identity: passed to
+# `jit` as it is, it would compile every search again. Only its arrays leave a compiled
+# function, and go back into a state that is built inside the next one, so that all searches
+# share one program. Our own solver's state is all arrays, and its steps are programs already.
 _REST = {"args": None, "options": {}, "tags": frozenset()}
+
+
+def _is_ours(solver: Any) -> bool:
+    return isinstance(solver, LevenbergMarquardt)
 
 
 def _new_state(solver: Any, fn: _Objective, y: Any) -> Any:
@@ -212,30 +220,48 @@ def _new_state(solver: Any, fn: _Objective, y: Any) -> Any:
     return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
 
 
-def _arrays(state: Any) -> list[Any]:
-    return jax.tree.leaves(eqx.filter(state, eqx.is_array))
+def _kept(solver: Any, state: Any) -> Any:
+    """What is kept of a state from one step to the next."""
+    return state if _is_ours(solver) else jax.tree.leaves(eqx.filter(state, eqx.is_array))
 
 
-def _state(solver: Any, fn: _Objective, y: Any, arrays: list[Any]) -> Any:
+def _state(solver: Any, fn: _Objective, y: Any, kept: Any) -> Any:
+    """The state of which `kept` was kept."""
+    if _is_ours(solver):
+        return kept
     old, static = eqx.partition(_new_state(solver, fn, y), eqx.is_array)
-    return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), arrays), static)
+    return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), kept), static)
 
 
 @eqx.filter_jit
 def _begin(solver, fn, y):
-    return _arrays(_new_state(solver, fn, y))
+    return _kept(solver, _new_state(solver, fn, y))
+
+
+def _step(solver, fn, y, kept):
+    """Unknowns, state, the loss before the step, whether the search has ended, its verdict."""
+    return (_take_step if _is_ours(solver) else _compiled_step)(solver, fn, y, kept)
+
+
+def _take_step(solver, fn, y, kept):
+    y, state, loss = solver.step(fn, y, state=_state(solver, fn, y, kept), **_REST)
+    return y, _kept(solver, state), loss, *solver.terminate(fn, y, state=state, **_REST)
+
+
+_compiled_step = eqx.filter_jit(_take_step)
+
+
+def _finish(solver, fn, y, kept, loss, result):
+    """The unknowns after the last step, and their loss."""
+    if _is_ours(solver):
+        return solver.postprocess(fn, y, loss, state=kept, result=result, **_REST)[:2]
+    y = _postprocessed(solver, fn, y, kept, loss, result)
+    return y, _loss(fn, y)
 
 
 @eqx.filter_jit
-def _step(solver, fn, y, arrays):
-    # The loss is that of the unknowns before the step.
-    y, state, loss = solver.step(fn, y, state=_state(solver, fn, y, arrays), **_REST)
-    return y, _arrays(state), loss, *solver.terminate(fn, y, state=state, **_REST)
-
-
-@eqx.filter_jit
-def _finish(solver, fn, y, arrays, loss, result):
-    state = _state(solver, fn, y, arrays)
+def _postprocessed(solver, fn, y, kept, loss, result):
+    state = _state(solver, fn, y, kept)
     return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[0]
 
 

@@ -1,5 +1,6 @@
 """The residual of `fit.dof`: what the model draws, less the photographs, after exposure."""
 
+import dataclasses
 import functools
 from typing import Literal, NamedTuple
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from jaxfx.fit._descent import linear
 from jaxfx.fit._exposure import exposure_between
 from jaxfx.fit._lens_model import Model, Values
 from jaxfx.fit._robust import huber
@@ -77,10 +79,16 @@ def plain(model: Model, exposure: bool, tone: Tone) -> Residual:
     return Residual(model, one, one[0, 0, 0], False, exposure, tone)
 
 
-@eqx.filter_jit
 def evaluate(residual: Residual, unknowns: Values) -> tuple[Array, Array, Array, Array]:
-    """`residual.compare`, compiled: all that needs no derivative shares this program."""
-    return residual.compare(unknowns)
+    """`residual.compare`, compiled: all that needs no derivative shares this program.
+
+    It takes as long to compile as the effect. The loss, of which it knows nothing, therefore
+    makes no second program.
+    """
+    return _compare(dataclasses.replace(residual, is_robust=False), unknowns)
+
+
+_compare = eqx.filter_jit(Residual.compare)
 
 
 def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " photograph"]:
@@ -110,20 +118,28 @@ class Report(NamedTuple):
     offset: Float[Array, "photograph channel"]
 
 
-@eqx.filter_jit
 def report(residual: Residual, unknowns: Values) -> Report:
-    """The residual, its derivatives, and the rest of `compare`."""
-    flat, tree = ravel_pytree(unknowns)
+    """The residual, its derivatives, and the rest of `compare`, by the programs of a search."""
+    jacobian = linear(residual, unknowns).jacobian
+    difference, *rest = evaluate(residual, unknowns)
+    if "aperture" in unknowns:
+        # An unknown of an aperture is its logarithm, which all circles of confusion follow.
+        still = jax.tree.map(jnp.zeros_like, unknowns)
+        direction = still | {"aperture": jnp.ones_like(unknowns["aperture"])}
+        widening = jacobian @ ravel_pytree(direction)[0]
+    else:
+        widening = _widening(residual, unknowns)
+    return Report(jacobian, widening, residual.weighted(difference), *rest)
+
+
+@eqx.filter_jit
+def _widening(residual: Residual, unknowns: Values) -> Float[Array, " residual"]:
+    """The derivative in the logarithm of a factor on all apertures, which are not sought."""
     aperture = residual.model.start["aperture"]
 
-    def both(flat):
-        wide = aperture * jnp.exp(flat[-1]).astype(aperture.dtype)
-        widened = eqx.tree_at(lambda r: r.model.start["aperture"], residual, wide)
-        difference, *rest = widened.compare(tree(flat[:-1]))
-        weighted = residual.weighted(difference)
-        return weighted, (weighted, *rest)
+    def widened(exponent):
+        wide = aperture * jnp.exp(exponent).astype(aperture.dtype)
+        return eqx.tree_at(lambda r: r.model.start["aperture"], residual, wide)(unknowns)
 
-    extended = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])
-    columns, (weighted, *rest) = jax.jacfwd(both, has_aux=True)(extended)
-    columns = columns.reshape(-1, extended.size)
-    return Report(columns[:, :-1], columns[:, -1], weighted, *rest)
+    zero = jnp.zeros((), float)
+    return jax.jvp(widened, (zero,), (jnp.ones_like(zero),))[1].reshape(-1)

@@ -3,11 +3,15 @@
 optimistix' own solver calls lineax, which compares the shardings of operator and vector: where
 data vary over the devices of a mesh they differ, and it raises. Steps, damping and tests are
 those of `optimistix.LevenbergMarquardt`, but for rounding.
+
+Outside of any transform a step is two programs: `linearised`, which takes long to compile and
+which a report of errors uses too, and what becomes of its numbers.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -30,7 +34,7 @@ class _State(NamedTuple):
     """Residual and Jacobian at the last accepted unknowns, and the unknowns to evaluate next.
 
     - `tried`: the unknowns to evaluate next.
-    - `residual`: at the accepted unknowns.
+    - `residual`, `aux`: at the accepted unknowns.
     - `triangle`: R of the QR decomposition of the Jacobian with the residual as its last
       column: all that a step and its promise depend on.
     - `radius`: the inverse of the damping.
@@ -80,63 +84,89 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state: _State, tags) -> tuple[Any, _State, Any]:
         """Evaluate the unknowns that are tried, accept them or not, and choose the next."""
         del options, tags
-        here, _ = ravel_pytree(y)
-        tried, unravel = ravel_pytree(state.tried)
-
-        def of_flat(flat):
-            residual, aux = fn(unravel(flat), args)
-            return residual.reshape(-1), aux
-
-        residual, push, aux = jax.linearize(of_flat, tried, has_aux=True)
-        basis = jnp.eye(tried.size, dtype=tried.dtype)
-        jacobian = jax.vmap(push, out_axes=1)(varying_as(tried, basis))
-        triangle = _triangle(jnp.concatenate([jacobian, residual[:, None]], axis=1))
-
-        moved = tried - here
-        promised = (
-            jnp.sum((state.triangle @ jnp.append(moved, 1)) ** 2)
-            - jnp.sum(state.triangle[:, -1] ** 2)
-        ) / 2
-        change = (jnp.sum(residual**2) - jnp.sum(state.residual**2)) / 2
-        is_good = ~state.is_first & (promised < 0) & (change < _GOOD * promised)
-        accepted = state.is_first | (change <= _ACCEPTED * promised)
-        factor = jnp.where(accepted, jnp.where(is_good, _LONGER, 1.0), _SHORTER)
-        radius = state.radius * factor.astype(state.radius.dtype)
-        is_small = lambda change, value: jnp.all(
-            jnp.abs(change) < self.atol + self.rtol * jnp.abs(value)
-        )
-        has_converged = (
-            accepted & is_small(moved, tried) & is_small(residual - state.residual, residual)
-        )
-        chosen = lambda new, old: jax.tree.map(
-            lambda new, old: jnp.where(accepted, new, old), new, old
-        )
-        triangle = chosen(triangle, state.triangle)
-        here = chosen(tried, here)
-        step = _damped(triangle, radius)
-        is_finite = jnp.all(jnp.isfinite(step))
-        result = _RESULTS.where(is_finite, _RESULTS.successful, _RESULTS.singular)
-        after = _State(
-            jnp.asarray(False),
-            unravel(here - step),
-            chosen(residual, state.residual),
-            triangle,
-            chosen(aux, state.aux),
-            radius,
-            has_converged,
-            result,
-        )
-        # What is reported belongs to the unknowns before the step.
-        before = jax.tree.map(lambda *x: jnp.where(state.is_first, *x), aux, state.aux)
-        return unravel(here), after, before
+        return _after(self, y, state, linearised(fn, state.tried, args))
 
     def terminate(self, fn, y, args, options, state: _State, tags):
         """Whether the search has ended, and its verdict."""
         return state.has_converged, state.result
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
-        """The unknowns as they are."""
-        return y, aux, {}
+        """The unknowns as they are, and what came beside their residual."""
+        return y, state.aux, {}
+
+
+class Linear(NamedTuple):
+    """A residual, its Jacobian and what comes beside it, at some unknowns.
+
+    Unknowns are in the order of `ravel_pytree`, residuals in that of the function's array.
+    """
+
+    residual: Float[Array, " residual"]
+    jacobian: Float[Array, "residual unknown"]
+    aux: Any
+
+
+@eqx.filter_jit
+def linearised(fn: Callable[[Any, Any], tuple[Array, Any]], y: Any, args: Any) -> Linear:
+    """A function that gives a residual and something beside it, linearised at `y`."""
+    flat, unravel = ravel_pytree(y)
+
+    def of_flat(flat):
+        residual, aux = fn(unravel(flat), args)
+        return residual.reshape(-1), aux
+
+    residual, push, aux = jax.linearize(of_flat, flat, has_aux=True)
+    basis = jnp.eye(flat.size, dtype=flat.dtype)
+    return Linear(residual, jax.vmap(push, out_axes=1)(varying_as(flat, basis)), aux)
+
+
+@eqx.filter_jit
+def _after(
+    solver: LevenbergMarquardt, y: Any, state: _State, linear: Linear
+) -> tuple[Any, _State, Any]:
+    """Unknowns, state and reported loss after a step to `state.tried`, linearised there."""
+    here, _ = ravel_pytree(y)
+    tried, unravel = ravel_pytree(state.tried)
+    residual, jacobian, aux = linear
+    triangle = _triangle(jnp.concatenate([jacobian, residual[:, None]], axis=1))
+
+    moved = tried - here
+    promised = (
+        jnp.sum((state.triangle @ jnp.append(moved, 1)) ** 2)
+        - jnp.sum(state.triangle[:, -1] ** 2)
+    ) / 2
+    change = (jnp.sum(residual**2) - jnp.sum(state.residual**2)) / 2
+    is_good = ~state.is_first & (promised < 0) & (change < _GOOD * promised)
+    accepted = state.is_first | (change <= _ACCEPTED * promised)
+    factor = jnp.where(accepted, jnp.where(is_good, _LONGER, 1.0), _SHORTER)
+    radius = state.radius * factor.astype(state.radius.dtype)
+    is_small = lambda change, value: jnp.all(
+        jnp.abs(change) < solver.atol + solver.rtol * jnp.abs(value)
+    )
+    has_converged = (
+        accepted & is_small(moved, tried) & is_small(residual - state.residual, residual)
+    )
+    chosen = lambda new, old: jax.tree.map(
+        lambda new, old: jnp.where(accepted, new, old), new, old
+    )
+    triangle = chosen(triangle, state.triangle)
+    here = chosen(tried, here)
+    step = _damped(triangle, radius)
+    is_finite = jnp.all(jnp.isfinite(step))
+    result = _RESULTS.where(is_finite, _RESULTS.successful, _RESULTS.singular)
+    after = _State(
+        jnp.asarray(False),
+        unravel(here - step),
+        chosen(residual, state.residual),
+        triangle,
+        chosen(aux, state.aux),
+        radius,
+        has_converged,
+        result,
+    )
+    # What is reported belongs to the unknowns before the step.
+    before = jax.tree.map(lambda *x: jnp.where(state.is_first, *x), aux, state.aux)
+    return unravel(here), after, before
 
 
 def _triangle(matrix: Float[Array, "row column"]) -> Float[Array, "few column"]:

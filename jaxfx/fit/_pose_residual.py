@@ -143,16 +143,9 @@ def _contrast(reference: Array, counts: Array) -> Array:
 
 
 @eqx.filter_jit
-def report(model: Residual, twist: Array) -> tuple[Array, Array, Comparison]:
-    """The columns of the Jacobian, the residual, and the comparison that it comes from."""
-
-    def both(twist: Array) -> tuple[Array, tuple[Array, Comparison]]:
-        compared = model.compare(twist)
-        residual = model.weighted(compared)
-        return residual, (residual, compared)
-
-    columns, (residual, compared) = jax.jacfwd(both, has_aux=True)(twist)
-    return columns.reshape(-1, 6), residual, compared
+def compared(model: Residual, twist: Float[Array, "6"]) -> Comparison:
+    """`model.compare`, compiled."""
+    return model.compare(twist)
 
 
 def largest(x: Array, size: int = 3) -> Array:

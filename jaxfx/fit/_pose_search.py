@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxfx._checks import is_concrete
 from jaxfx._loops import scan, varying_as
 from jaxfx.fit._descent import End
-from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps, report
+from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps, compared
 from jaxfx.fit._reduction import reduced, shrunk, thinned
 
 
@@ -69,7 +69,7 @@ def search(
         )
         clear = clear_of_steps(views.depth, threshold)
         first = Residual(soft, clear, unit, jnp.ones(2, float), threshold, exposure, stride)
-        return eqx.tree_at(lambda m: m.scale, first, _scale(report(first, twist)[2]))
+        return eqx.tree_at(lambda m: m.scale, first, _scale(compared(first, twist)))
 
     small = _small(views)
     twist, losses = varying_as(views, jnp.zeros(6, float)), []
@@ -122,16 +122,16 @@ def _small(views: Views) -> Views:
     )
 
 
-def _scale(compared: Comparison) -> Float[Array, "2"]:
+def _scale(comparison: Comparison) -> Float[Array, "2"]:
     """Standard deviations of noise in color and, where the reference has one, in depth.
 
     From the median of the absolute differences, which outliers do not move.
     """
-    channels = compared.gain.size
-    is_compared = compared.counts[..., None] > 0
-    sizes = jnp.where(is_compared, jnp.abs(compared.deviations), jnp.nan)
+    channels = comparison.gain.size
+    is_compared = comparison.counts[..., None] > 0
+    sizes = jnp.where(is_compared, jnp.abs(comparison.deviations), jnp.nan)
     color, depth = sizes[..., :channels], sizes[..., channels:]
-    least = _LEAST_COLOR * jnp.sqrt(compared.contrast.astype(float)) + _LEAST_RADIANCE
+    least = _LEAST_COLOR * jnp.sqrt(comparison.contrast.astype(float)) + _LEAST_RADIANCE
     color = jnp.nan_to_num(_DEVIATION_OF_MEDIAN * jnp.nanmedian(color))
     color = jnp.maximum(color, least)
     if depth.size == 0:

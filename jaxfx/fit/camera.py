@@ -24,10 +24,10 @@ from jaxfx._checks import (
 from jaxfx._numerics import safe_divide
 from jaxfx._progress import Bar
 from jaxfx.camera import PinholeCamera
-from jaxfx.fit._descent import End, Solver, check_success, descend
+from jaxfx.fit._descent import End, Solver, check_success, descend, linear
 from jaxfx.fit._in_program import fitted_under_transform, joined
 from jaxfx.fit._jackknife import covariance, tiles
-from jaxfx.fit._pose_residual import Residual, Views, report
+from jaxfx.fit._pose_residual import Residual, Views, compared
 from jaxfx.fit._pose_search import search
 from jaxfx.fit._robust import huber
 from jaxfx.reproject.arguments import check_image_depth, check_threshold
@@ -215,18 +215,19 @@ def camera(
 
 def _fitted(model: Residual, end: End) -> CameraFit:
     """The result at the end of a search: pose, exposure, covariance and quality."""
-    columns, residual, compared = report(model, end.unknowns)
-    block, count = tiles(residual.shape)
-    spread = covariance(columns, residual.reshape(-1), block, count)
+    at_end = linear(model, end.unknowns)
+    found = compared(model, end.unknowns)
+    block, count = tiles(found.deviations.shape)
+    spread = covariance(at_end.jacobian, at_end.residual, block, count)
     spread = spread * model.unit[:, None] * model.unit[None]
-    share = jnp.mean(compared.counts)
-    color = compared.deviations[..., : compared.gain.size]
-    rest = jnp.mean((model.scale[0] * huber(color)) ** 2 * compared.counts[..., None])
-    contrast = share * compared.contrast.astype(float)
+    share = jnp.mean(found.counts)
+    color = found.deviations[..., : found.gain.size]
+    rest = jnp.mean((model.scale[0] * huber(color)) ** 2 * found.counts[..., None])
+    contrast = share * found.contrast.astype(float)
     return CameraFit(
         camera=model.moved(end.unknowns),
-        gain=compared.gain,
-        offset=compared.offset,
+        gain=found.gain,
+        offset=found.offset,
         losses=joined(end.losses),
         covariance=jnp.where(share > 0, spread, jnp.inf),
         share=share,
