@@ -169,8 +169,11 @@ class Model(eqx.Module):
         circles = jnp.stack([lens.circle_of_confusion(depth) for lens in lenses])
         return jnp.where(depth > 0, circles, 0)
 
-    def __call__(self, values: Values) -> Float[Array, "photograph height width channel"]:
-        """The images that the effect draws, footprint included."""
+    def __call__(self, values: Values) -> tuple[Array, Array]:
+        """The images that the effect draws, and those with the footprint that it lacks.
+
+        Both are photograph height width channel.
+        """
         depth, behind = self.depths(values)
 
         iris = self.shape(values)
@@ -199,14 +202,15 @@ class Model(eqx.Module):
                     iris=iris,
                 )
             if "footprint" not in self.names:
-                return drawn
+                return drawn, drawn
             coc = jnp.where(depth > 0, lens.circle_of_confusion(depth), 0)
-            return drawn + values["footprint"] * missing_blur(drawn, coc)
+            return drawn, drawn + values["footprint"] * missing_blur(drawn, coc)
 
         focal_pixels = self.images.focal_pixels
         apertures, focus_distances = (values[name] for name in LENS)
         if focal_pixels.size == 1:
-            return draw(apertures[0], focus_distances[0], focal_pixels[0])[None]
+            drawn, corrected = draw(apertures[0], focus_distances[0], focal_pixels[0])
+            return drawn[None], corrected[None]
         return jax.vmap(draw)(apertures, focus_distances, focal_pixels)
 
 

@@ -51,14 +51,15 @@ def weighed(residual: Residual, unknowns: Values, has_edges: bool) -> Residual:
     `has_edges`: whether pixels that the sprite of an edge in depth reaches have a noise of
     their own.
     """
-    difference, drawn, *_ = evaluate(residual, unknowns)
+    compared = evaluate(residual, unknowns)
     names = [name for name in unknowns if name in LENS + DISPARITY + IRIS]
     names = names or [name for name in unknowns if name != "footprint"]
     nudged = [unknowns | {name: unknowns[name] + _NUDGE} for name in names]
-    change = lambda nudged: (evaluate(residual, nudged)[1] - drawn) ** 2
+    images = lambda at: evaluate(residual, at).corrected
+    change = lambda nudged: (images(nudged) - compared.corrected) ** 2
     sensitivity = functools.reduce(jnp.add, each(change, nudged, (residual, unknowns)))
     values = residual.model.values(unknowns)
-    scale, unit = _noise(residual.model, values, difference, sensitivity, has_edges)
+    scale, unit = _noise(residual.model, values, compared.difference, sensitivity, has_edges)
     return dataclasses.replace(residual, scale=scale, unit=unit, is_robust=True)
 
 

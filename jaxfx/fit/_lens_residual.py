@@ -19,6 +19,22 @@ from jaxfx.fit._robust import huber
 Tone = Literal["linear", "log"]
 
 
+class Comparison(NamedTuple):
+    """Images beside the photographs, at some unknowns.
+
+    - `difference`: photograph height width channel, after gain, offset and tone.
+    - `drawn`: by the effect.
+    - `corrected`: the same with the footprint, before gain and offset.
+    - `gain`, `offset`: a ratio and units of radiance.
+    """
+
+    difference: Float[Array, "photograph height width channel"]
+    drawn: Float[Array, "photograph height width channel"]
+    corrected: Float[Array, "photograph height width channel"]
+    gain: Float[Array, "photograph channel"]
+    offset: Float[Array, "photograph channel"]
+
+
 class Residual(eqx.Module):
     """The images drawn less the references, weighted, as a function of the unknowns.
 
@@ -36,21 +52,21 @@ class Residual(eqx.Module):
     exposure: bool = eqx.field(static=True)
     tone: Tone = eqx.field(static=True)
 
-    def compare(self, unknowns: Values) -> tuple[Array, Array, Array, Array]:
-        """The difference per pixel after tone, the images drawn, and their gain and offset."""
+    def compare(self, unknowns: Values) -> Comparison:
+        """The images drawn at these unknowns, and how they differ from the photographs."""
         images = self.model.images
-        drawn = self.model(self.model.values(unknowns))
+        drawn, corrected = self.model(self.model.values(unknowns))
         counts = images.weights[None] / (self.scale / self.unit) ** 2
 
         def exposed(drawn, reference, counts, scale):
             return exposure_between(drawn, reference, counts, scale[..., None], self.exposure)
 
-        gain, offset = jax.vmap(exposed)(drawn, images.references, counts, self.scale)
-        shown = gain * drawn + offset
+        gain, offset = jax.vmap(exposed)(corrected, images.references, counts, self.scale)
+        shown = gain * corrected + offset
         tone = functools.partial(_log_tone, white=jnp.mean(jnp.abs(images.references)))
         toned = tone if self.tone == "log" else lambda x: x
         difference = toned(shown) - toned(images.references)
-        return difference, drawn, gain[:, 0, 0], offset[:, 0, 0]
+        return Comparison(difference, drawn, corrected, gain[:, 0, 0], offset[:, 0, 0])
 
     def weighted(self, difference: Array) -> Float[Array, "photograph height width channel"]:
         """Differences per pixel as residuals: their squares are the loss.
@@ -64,7 +80,7 @@ class Residual(eqx.Module):
         return self.unit.astype(float) * root.astype(float) * huber(deviations)
 
     def __call__(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
-        return self.weighted(self.compare(unknowns)[0])
+        return self.weighted(self.compare(unknowns).difference)
 
 
 def _log_tone(x: Array, white: Array) -> Array:
@@ -79,7 +95,7 @@ def plain(model: Model, exposure: bool, tone: Tone) -> Residual:
     return Residual(model, one, one[0, 0, 0], False, exposure, tone)
 
 
-def evaluate(residual: Residual, unknowns: Values) -> tuple[Array, Array, Array, Array]:
+def evaluate(residual: Residual, unknowns: Values) -> Comparison:
     """`residual.compare`, compiled: all that needs no derivative shares this program.
 
     It takes as long to compile as the effect. The loss, of which it knows nothing, therefore
@@ -97,7 +113,7 @@ def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " photograph
     It ranks lenses before any noise is estimated: unlike a mean square, it is not decided by a
     few large differences.
     """
-    difference = evaluate(residual, unknowns)[0]
+    difference = evaluate(residual, unknowns).difference
     weights = residual.model.images.weights[None, ..., None]
     return jnp.mean(jnp.abs(difference) * weights, axis=(1, 2, 3))
 
@@ -107,21 +123,18 @@ class Report(NamedTuple):
 
     - `columns`: the Jacobian in the order of `ravel_pytree`.
     - `widening`: the derivative in the logarithm of a factor on all circles of confusion.
-    - `drawn`, `gain`, `offset`: as `Residual.compare` gives them.
     """
 
     columns: Float[Array, "residual unknown"]
     widening: Float[Array, " residual"]
     residual: Float[Array, "photograph height width channel"]
-    drawn: Float[Array, "photograph height width channel"]
-    gain: Float[Array, "photograph channel"]
-    offset: Float[Array, "photograph channel"]
+    compared: Comparison
 
 
 def report(residual: Residual, unknowns: Values) -> Report:
-    """The residual, its derivatives, and the rest of `compare`, by the programs of a search."""
+    """The residual, its derivatives and the comparison, by the programs of a search."""
     jacobian = linear(residual, unknowns).jacobian
-    difference, *rest = evaluate(residual, unknowns)
+    compared = evaluate(residual, unknowns)
     if "aperture" in unknowns:
         # An unknown of an aperture is its logarithm, which all circles of confusion follow.
         still = jax.tree.map(jnp.zeros_like, unknowns)
@@ -129,7 +142,7 @@ def report(residual: Residual, unknowns: Values) -> Report:
         widening = jacobian @ ravel_pytree(direction)[0]
     else:
         widening = _widening(residual, unknowns)
-    return Report(jacobian, widening, residual.weighted(difference), *rest)
+    return Report(jacobian, widening, residual.weighted(compared.difference), compared)
 
 
 @eqx.filter_jit

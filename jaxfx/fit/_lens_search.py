@@ -82,7 +82,7 @@ class Search(NamedTuple):
         residual = self.residual(small)
         starts = self._best_starts(residual)
         origin = _origin(small, self.ratios)
-        losses = [jnp.mean(residual.weighted(evaluate(residual, origin)[0]) ** 2)]
+        losses = [jnp.mean(residual.weighted(evaluate(residual, origin).difference) ** 2)]
         ends = self._refined(residual, starts)
         for name in (name for name in _SOFT if name in model.names):
             best = _ranked(residual, ends)[0].unknowns

@@ -23,7 +23,7 @@ from jaxfx.fit._in_program import fitted_under_transform, joined
 from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Model, Values
 from jaxfx.fit._lens_noise import defocus
-from jaxfx.fit._lens_residual import Report, Residual, Tone, evaluate, plain, report
+from jaxfx.fit._lens_residual import Report, Residual, Tone, plain, report
 from jaxfx.fit._lens_search import Search
 from jaxfx.lens import ThinLens
 
@@ -293,7 +293,7 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     ones = jax.tree.map(jnp.ones_like, end.unknowns)
     slopes = jax.jvp(model.values, (end.unknowns,), (ones,))[1]
     references = model.images.references
-    is_single, is_plain = len(references) == 1, "footprint" not in model.names
+    is_single = len(references) == 1
     # A photograph tells two numbers: aperture x scale, and aperture x (1 / focus - shift).
     sought = [name for name in (*LENS, *DISPARITY) if name in end.unknowns]
     if sum(jnp.size(end.unknowns[name]) for name in sought) > 2 * len(references):
@@ -302,7 +302,6 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     for name in (name for name in model.names if name != "footprint"):
         error = jnp.abs(slopes[name].astype(float)) * jnp.sqrt(variances[name])
         standard_errors[name] = error[0] if is_single and name in LENS else error
-    without_footprint = eqx.tree_at(lambda r: r.model.corrects, residual, jnp.zeros(()))
     mean = jnp.mean(references, axis=(1, 2), keepdims=True)
     contrast = jnp.mean(residual.weighted(references - mean) ** 2)
     unexplained = jnp.mean(reported.residual**2)
@@ -310,9 +309,9 @@ def _fitted(residual: Residual, end: End, ends: tuple[dict[str, Array], ...]) ->
     names = ("gamma", "epsilon", "threshold", "scale", "shift", "footprint")
     return DofFit(
         lenses=tuple(model.lens(values, photograph) for photograph in range(len(references))),
-        gain=reported.gain,
-        offset=reported.offset,
-        images=reported.drawn if is_plain else evaluate(without_footprint, end.unknowns)[1],
+        gain=reported.compared.gain,
+        offset=reported.compared.offset,
+        images=reported.compared.drawn,
         losses=joined(end.losses),
         ends=ends,
         standard_errors=standard_errors,
