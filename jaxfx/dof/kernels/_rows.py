@@ -78,20 +78,20 @@ def _sums(
             ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0)
         )
         spans = half_widths(sprite if by_source else at_rows(sprite), row)
-        added = []
-        for kernel in kernels:
-            # Else what several kernels share would be kept, for every tap.
-            spans, own, other = jax.lax.optimization_barrier((spans, at_pixel, there))
-            wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
-            passed = factor * wide[0] + shift
-            covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
-            near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), other)
-            terms = jax.tree.leaves(tap(*covers, own, near))
-            added += summed([terms[k] for k in kernel], (0, 2))
-        return [*map(jnp.add, sums, added)]
+        # Kept in memory.
+        spans = jax.lax.optimization_barrier(spans)
+        wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
+        near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), there)
+        inputs = wide, factor, shift, at_pixel, near
+        return sums + jnp.stack(summed(term, inputs, (0, 2)))
 
-    sums = fori_loop(0, turns, turn, [jnp.zeros_like(radius) for _ in planes])
-    sums = jax.tree.unflatten(tree, sums)
+    def term(wide, factor, shift, own, other):
+        passed = factor * wide[0] + shift
+        covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
+        return tap(*covers, own, other)
+
+    nothing = jnp.stack([jnp.zeros_like(radius) for _ in planes])
+    sums = jax.tree.unflatten(tree, [*fori_loop(0, turns, turn, nothing)])
     return [jnp.stack(x) if isinstance(x, list) else x for x in sums]
 
 

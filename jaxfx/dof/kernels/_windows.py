@@ -41,37 +41,46 @@ def windows(x: Shaped[Array, "..."], axis: int, count: int) -> Shaped[Array, "..
 
 
 def summed(
-    terms: list[Float[Array, "..."]],
-    axes: tuple[int, ...],
-    factor: Float[Array, "..."] | None = None,
+    term: Callable[..., Any], inputs: tuple[Any, ...], axes: tuple[int, ...]
 ) -> list[Float[Array, "..."]]:
-    """The sum of each of some arrays of one shape over these axes, the first of even length.
+    """The sums of `term(*inputs)` over these axes, one for each number that it gives.
 
-    `factor` multiplies every term; what takes long to compute is then computed once for two.
+    `inputs` are trees of arrays of one dtype that broadcast together; `term` is given one
+    element of each.
     """
-    paired = len(terms) // 2 * 2
-    arrays = [*map(jax.lax.complex, terms[:paired:2], terms[1:paired:2]), *terms[paired:]]
-    if factor is not None:
-        arrays = [x * factor.astype(x.dtype) for x in arrays]
-    if len(arrays) == 1:
-        # The sum of a single array XLA would cut in two, one after the other.
-        first, second = _summed(jnp.split(arrays[0], 2, axes[0]), axes)
-        sums = [first + second]
-    else:
-        sums = _summed(arrays, axes)
-    pairs = sums[: paired // 2]
-    return [part for x in pairs for part in (x.real, x.imag)] + sums[len(pairs) :]
+    leaves, tree = jax.tree.flatten(inputs)
+    of_leaves = lambda *leaves: jax.tree.leaves(term(*jax.tree.unflatten(tree, leaves)))
+    shape = jnp.broadcast_shapes(*(x.shape for x in leaves))
+    return _summed([jnp.broadcast_to(x, shape) for x in leaves], of_leaves, axes)
 
 
-@ft.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _summed(terms, axes):
-    zeros = [jnp.zeros((), x.dtype) for x in terms]
-    return jax.lax.reduce(terms, zeros, lambda x, y: [*map(jnp.add, x, y)], axes)
+@ft.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _summed(leaves, term, axes):
+    dtype = leaves[0].dtype
+    count = len(jax.eval_shape(term, *[jax.ShapeDtypeStruct((), dtype)] * len(leaves)))
+    slots = leaves + [jnp.zeros_like(leaves[0])] * (count - len(leaves))
+
+    def total(is_term, *slots):
+        return [
+            jnp.where(is_term, x, y)
+            for x, y in zip(term(*slots[: len(leaves)]), slots[:count], strict=True)
+        ]
+
+    def add(one, other):
+        sums = [*map(jnp.add, total(*one), total(*other))]
+        return [jnp.zeros((), bool), *sums, *[jnp.zeros((), dtype)] * (len(slots) - count)]
+
+    operands = [jnp.ones_like(leaves[0], bool), *slots]
+    nothing = [jnp.zeros((), x.dtype) for x in operands]
+    return jax.lax.reduce(operands, nothing, add, axes)[1 : 1 + count]
 
 
 @_summed.defjvp
-def _(axes, primals, tangents):
-    return _summed(*primals, axes), _summed(*tangents, axes)
+def _(term, axes, primals, tangents):
+    (leaves,), (dots,) = primals, tangents
+    count = len(leaves)
+    tangent = lambda *both: jax.jvp(term, both[:count], both[count:])[1]
+    return _summed(leaves, term, axes), _summed([*leaves, *dots], tangent, axes)
 
 
 def in_turns(offsets: int, most: int) -> tuple[int, int]:
