@@ -299,6 +299,7 @@ def _step_all(pyramid, r, state, steps, max_steps):
     Where nothing bounds the steps the loop does not read their counts: XLA then leaves out
     those that nobody asks for, and keeps one state per ray instead of seven.
     """
+
     def is_unfinished(state, steps):
         if max_steps == np.iinfo(np.int32).max:
             return level_of(state) < MISS
