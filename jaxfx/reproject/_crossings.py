@@ -81,8 +81,8 @@ def grid_rays(
     origin: Float[Array, "ray 3"], direction: Float[Array, "ray 3"], origin_at_end: bool = False
 ) -> GridRays:
     """Rays by coordinate. Where x or y is constant, it is moved to the middle of its texels."""
-    dx, dy, dz = (jnp.where(d == 0, 0, d) for d in jnp.moveaxis(direction, -1, 0))
-    ox, oy, oz = jnp.moveaxis(origin, -1, 0)
+    dx, dy, dz = (jnp.where(d == 0, 0, d) for d in (direction[:, k] for k in range(3)))
+    ox, oy, oz = (origin[:, k] for k in range(3))
     ox = jnp.where(dx == 0, jnp.floor(ox) + 0.5, ox)
     oy = jnp.where(dy == 0, jnp.floor(oy) + 0.5, oy)
     return GridRays(ox, oy, oz, dx, dy, dz, 1 / dx, 1 / dy, 1 / dz, origin_at_end)

@@ -167,8 +167,8 @@ def _texel_miss(
     Only its tangent is used. So for a side the constant position of the border is left out. For
     a ray that starts inside the column it is 0: the time does not depend on anything.
     """
-    x, y, z = jnp.moveaxis(origin + hit.time[:, None] * direction, -1, 0)
-    dx, dy, dz = jnp.moveaxis(jax.lax.stop_gradient(direction), -1, 0)
+    x, y, z = _point_on(origin, direction, hit.time)
+    dx, dy, dz = (jax.lax.stop_gradient(direction[:, k]) for k in range(3))
     top = jnp.where(hit.mask, height_field[hit.y, hit.x], 0)
     zeros = [jnp.zeros_like(x)] * 4
     miss, slope = list(zeros), [jnp.ones_like(x)] * 4
@@ -196,19 +196,21 @@ def patch_point(
     grazes the patch, the point and its derivative are those of the texel.
     """
     hold = jax.lax.stop_gradient
-    held_field, o, d = hold(height_field), hold(origin), hold(direction)
+    # By coordinate: what a loop reads is kept as it is.
+    rays = [[x[:, k] for k in range(3)] for x in (origin, direction)]
+    held_field, (o, d) = hold(height_field), hold(rays)
     anchor = jnp.where(hit.mask, held_field[hit.y, hit.x], 0)
 
     def patch_miss(height_field, origin, direction, time):
-        x, y, z = jnp.moveaxis(origin + time[:, None] * direction, -1, 0)
+        x, y, z = (o + time * d for o, d in zip(origin, direction, strict=True))
         return z - edge_aware_patch(held_field, x, y, anchor, threshold).read(height_field)
 
     value_and_slope = lambda time: jax.jvp(
         lambda t: patch_miss(held_field, o, d, t), (time,), (jnp.ones_like(time),)
     )
-    speed = jnp.maximum(jnp.abs(d[:, 0]), jnp.abs(d[:, 1]))  # texels per unit of time
+    speed = jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1]))  # texels per unit of time
     reach = jnp.where(speed > 0, _REACH_TEXELS / jnp.where(speed > 0, speed, 1), jnp.inf)
-    low = not_before_start(hit.time - reach, d[:, 2], origin_at_end)
+    low = not_before_start(hit.time - reach, d[2], origin_at_end)
     high = hit.time + reach
 
     def newton(index, state):
@@ -224,12 +226,12 @@ def patch_point(
     # of the loop, XLA would compute the slope again wherever it is used.
     start = hit.time, jnp.full_like(hit.time, jnp.inf), jnp.ones_like(hit.time)
     time, last_move, slope = fori_loop(0, _NEWTON_STEPS + 1, newton, start)
-    terms = jnp.abs(d[:, 2]) + jnp.abs(slope - d[:, 2])
+    terms = jnp.abs(d[2]) + jnp.abs(slope - d[2])
     is_steep = slope > _MIN_SLOPE * terms
     is_on_patch = is_steep & (last_move * speed < _CONVERGED_TEXELS) & hit.mask
     time = jnp.where(is_on_patch, time, hit.time)
     texel_miss, texel_slope = _texel_miss(height_field, origin, direction, hit)
-    miss = patch_miss(height_field, origin, direction, time)
+    miss = patch_miss(height_field, *rays, time)
     miss = jnp.where(is_on_patch, miss, texel_miss)
     slope = jnp.where(is_on_patch, slope, texel_slope)
     is_differentiable, grazing = hit.mask & (slope != 0), hit.mask & ~is_on_patch
@@ -245,7 +247,12 @@ def _implicit_point(
     """
     miss = jnp.where(is_differentiable, miss, 0)
     time = _implicit_root(time, miss, jnp.where(is_differentiable, slope, 1))
-    return SurfacePoint(origin + time[:, None] * direction, grazing)
+    return SurfacePoint(jnp.stack(_point_on(origin, direction, time), axis=-1), grazing)
+
+
+def _point_on(origin: Array, direction: Array, time: Array) -> list[Float[Array, " ray"]]:
+    """x, y and z of rays at a time."""
+    return [origin[:, k] + time * direction[:, k] for k in range(3)]
 
 
 @jax.custom_jvp

@@ -12,6 +12,7 @@ plane and the other far away. Lengths are in units of the near plane's depth, wh
 numbers of any scene within the range of float32.
 """
 
+import functools as ft
 from typing import NamedTuple
 
 import jax
@@ -54,12 +55,17 @@ def view_rays(
     length = _length(vanishing, eye, begin, end)
     # Outside the frustum all factors are finite: the derivative, 0 times them, is then 0.
     is_ray = (begin < end) & jnp.isfinite(length)
-    direction = _direction(vanishing, eye) * jnp.where(is_ray, length, 0)[:, None]
-    runs_away = jax.lax.stop_gradient(direction[:, 2]) > 0
+    # By coordinate up to here: else XLA for a GPU would keep each ray in two orders.
+    direction = [x * jnp.where(is_ray, length, 0) for x in _direction(vanishing, eye)]
+    runs_away = jax.lax.stop_gradient(direction[2]) > 0
     origin_depth = jnp.where(is_ray, jnp.where(runs_away, end, begin), 1)
     origin = _point_at(vanishing, eye, origin_depth)
-    inside = is_ray & jnp.isfinite(origin + direction).all(axis=-1)
-    origin, direction = (jnp.where(inside[:, None], x, 0) for x in (origin, direction))
+    sums = map(jnp.add, origin, direction)
+    inside = ft.reduce(jnp.logical_and, map(jnp.isfinite, sums), is_ray)
+    origin, direction = (
+        jnp.stack([jnp.where(inside, x, 0) for x in planes], axis=-1)
+        for planes in (origin, direction)
+    )
     return ViewRays(origin, direction, inside)
 
 
@@ -126,10 +132,10 @@ def _clip(vanishing: _Point, eye: _Point, height: int, width: int) -> tuple[Arra
     return begin, end
 
 
-def _direction(vanishing: _Point, eye: _Point) -> Float[Array, "ray 3"]:
+def _direction(vanishing: _Point, eye: _Point) -> _Point:
     """The direction in (x, y, -1/z) in which points move with growing target depth."""
     (x, y, z), (eye_x, eye_y, eye_z) = vanishing, eye
-    return jnp.stack((x * eye_z - eye_x * z, y * eye_z - eye_y * z, z), axis=-1)
+    return x * eye_z - eye_x * z, y * eye_z - eye_y * z, z
 
 
 def _length(vanishing: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, " ray"]:
@@ -141,7 +147,7 @@ def _length(vanishing: _Point, eye: _Point, begin: Array, end: Array) -> Float[A
     return (1 - begin * inverse_end) / (jnp.maximum(z_begin, 1) * z_end)
 
 
-def _point_at(vanishing: _Point, eye: _Point, target_depth: Array) -> Float[Array, "ray 3"]:
+def _point_at(vanishing: _Point, eye: _Point, target_depth: Array) -> _Point:
     """(x, y, -1/z) at a depth of the target, which may be 0 or infinite."""
     is_eye = target_depth == 0
     reciprocal = 1 / jnp.where(is_eye, 1, target_depth)
@@ -149,4 +155,4 @@ def _point_at(vanishing: _Point, eye: _Point, target_depth: Array) -> Float[Arra
         jnp.where(is_eye, e, v + reciprocal * e) for v, e in zip(vanishing, eye, strict=True)
     )
     z = jnp.where(z > 0, z, 1)
-    return jnp.stack([x / z, y / z, -jnp.where(is_eye, 1, reciprocal) / z], axis=-1)
+    return x / z, y / z, -jnp.where(is_eye, 1, reciprocal) / z

@@ -21,7 +21,8 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt32
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxfx._loops import while_loop
 from jaxfx._platform import by_platform
@@ -115,7 +116,7 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     offset = jnp.asarray(pyramid.offsets, jnp.int32)[read_level]
     cell_x, cell_y = x >> read_level, y >> read_level
     index = offset + cell_y * columns + cell_x
-    nearest = pyramid.values.at[index].get(mode="promise_in_bounds")
+    nearest = _read(pyramid.values, index)
 
     border_x, border_y = (cell_x + 1 - left) << read_level, (cell_y + 1 - up) << read_level
     leave_x = crossing_moment(border_x, r.ox, r.ix, left)
@@ -153,6 +154,20 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     is_done = is_hit | is_miss
     next_x, next_y = jnp.where(is_done, x, next_x), jnp.where(is_done, y, next_y)
     return jnp.where(level >= MISS, state, pack(next_x, next_y, next_level, left, up))
+
+
+@custom_vmap
+def _read(values: Float[Array, " cell"], index: Int[Array, "*ray"]) -> Float[Array, "*ray"]:
+    """Cells by index; of a batch of pyramids, as one array: a gather of one number is cheap."""
+    return values.at[index].get(mode="promise_in_bounds")
+
+
+@_read.def_vmap
+def _(size, is_batched, values, index):
+    if is_batched[0]:
+        first = jnp.arange(size, dtype=index.dtype) * values.shape[-1]
+        index, values = index + first[:, None], values.reshape(-1)
+    return _read(values, index), True
 
 
 def _clip_to_cell(
@@ -279,16 +294,24 @@ def _step_packed(pyramid, r, state, steps, max_steps):
 
 
 def _step_all(pyramid, r, state, steps, max_steps):
-    """The final states and step counts on an accelerator: all rays step to the end."""
+    """The final states and step counts on an accelerator: all rays step to the end.
+
+    Where nothing bounds the steps the loop does not read their counts: XLA then leaves out
+    those that nobody asks for, and keeps one state per ray instead of seven.
+    """
+
+    def is_unfinished(state, steps):
+        if max_steps == np.iinfo(np.int32).max:
+            return level_of(state) < MISS
+        return _is_unfinished(state, steps, max_steps)
 
     def goes_on(carry):
-        state, steps = carry
-        return jnp.any(_is_unfinished(state, steps, max_steps))
+        return jnp.any(is_unfinished(*carry))
 
     def body(carry):
         state, steps = carry
         for _ in range(_STEPS_PER_CHECK):
-            unfinished = _is_unfinished(state, steps, max_steps)
+            unfinished = is_unfinished(state, steps)
             state = jnp.where(unfinished, step(pyramid, r, state), state)
             steps = steps + unfinished.astype(jnp.int32)
         return state, steps

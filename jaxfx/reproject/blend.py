@@ -33,9 +33,11 @@ from jaxfx.reproject.view import trace_with_angle
 # Pixels. `choose` traces one ray for each square of this side. A larger one is cheaper, and may
 # overlook what a camera shows in places smaller than it; `worth` is then a coarser mean.
 _STRIDE = 8
-# Rays that an accelerator traces at once, of all cameras together. Each takes some 150 bytes
-# until its pixel is blended; with fewer rays at a time there are more launches.
-_RAYS_AT_ONCE = 2**20
+# Rays that an accelerator traces at once, of all cameras together. Each takes some 100 bytes
+# while it is stepped; with fewer rays at a time there are more launches.
+_RAYS_AT_ONCE = 3 * 2**18
+# Pixels of one part are a multiple of this: of an odd number XLA fuses less.
+_WHOLE_PIXELS = 1024
 
 
 @on_any_mesh
@@ -117,26 +119,46 @@ def _blended(
         colors = view.patch.read_colors(image).astype(images[0].dtype)
         return colors, view.mask, cosine, target_depth
 
-    def blended(pixels: Array) -> tuple[Array, Array]:
-        of_source = functools.partial(warped, pixels)
-        found = _over_cameras(of_source, images, depths, cameras)
-        colors, mask, cosine, target_depth = found
+    def weights_of(mask: Array, cosine: Array, target_depth: Array) -> Array:
+        """The weight of each camera in each pixel, camera pixel 1."""
         nearest = jnp.min(jnp.where(mask, target_depth, jnp.inf), axis=0)
         is_in_front = mask & (target_depth <= (1 + options["hole_threshold"]) * nearest[None])
         weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0))[..., None]
-        weight = weight.astype(colors.dtype)
-        total = sum_planes(jnp.where(weight > 0, colors, 0) * weight)
+        return weight.astype(images[0].dtype)
+
+    def mean(total: Array, weight: Array) -> tuple[Array, Array]:
         weight_sum = jnp.broadcast_to(sum_planes(weight), total.shape)
         alpha = (weight_sum[:, 0] > 0).astype(total.dtype)
         return safe_divide(total, weight_sum), alpha
 
+    def blended(pixels: Array) -> tuple[Array, Array]:
+        of_source = functools.partial(warped, pixels)
+        colors, *found = _over_cameras(of_source, images, depths, cameras)
+        weight = weights_of(*found)
+        return mean(sum_planes(jnp.where(weight > 0, colors, 0) * weight), weight)
+
+    def traced(pixels: Array, depth: Array, camera: PinholeCamera) -> tuple:
+        view, cosine, target_depth = trace_with_angle(depth, camera, target, pixels, **options)
+        return view.patch, view.mask, cosine, target_depth
+
+    def of_all_rays(pixels: Array) -> tuple[Array, Array]:
+        of_source = functools.partial(traced, pixels)
+        patches, *found = _over_cameras(of_source, depths, cameras)
+        weights, total = weights_of(*found), 0
+        for k, (image, weight) in enumerate(zip(images, weights, strict=True)):
+            patch = jax.tree.map(lambda x, k=k: x[k], patches)
+            colors = patch.read_colors(image).astype(weights.dtype)
+            total = total + jnp.where(weight > 0, colors, 0) * weight
+        return mean(total, weights)
+
     def in_parts(pixels: Array) -> tuple[Array, Array]:
         parts = -(-len(images) * len(pixels) // _RAYS_AT_ONCE)
         if parts <= 1:
-            return blended(pixels)
-        each = -(-len(pixels) // parts)
+            return of_all_rays(pixels)
+        each = -(-len(pixels) // (parts * _WHOLE_PIXELS)) * _WHOLE_PIXELS
+        parts = -(-len(pixels) // each)
         filled = jnp.pad(pixels, ((0, parts * each - len(pixels)), (0, 0)), mode="edge")
-        found = jax.lax.map(blended, filled.reshape(parts, each, 2))
+        found = jax.lax.map(of_all_rays, filled.reshape(parts, each, 2))
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(pixels)], found)
 
     image, alpha = by_platform(pixels, cpu=blended, accelerator=in_parts)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._numerics import normalize
+from jaxfx._platform import by_platform
 from jaxfx.camera import Camera, PinholeCamera
 from jaxfx.camera.rigid import per_depth
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, start_time
@@ -71,12 +72,22 @@ def trace_pixels(
     rays = view_rays(camera, target, pixels, height=height, width=width, unit=unit)
     ray = rays.origin, rays.direction
     hit = first_crossing(inverse_depth, *ray, search, max_steps, origin_at_end=True)
+
+    def computed_again(pixels, time, *_):
+        pixels, _ = jax.lax.optimization_barrier((pixels, time))
+        again = view_rays(camera, target, pixels, height=height, width=width, unit=unit)
+        return again.origin, again.direction
+
+    # An accelerator has them twice rather than keep both forms while the rays are stepped.
+    ray = by_platform(
+        pixels, hit.time, *ray, cpu=lambda _, __, *ray: ray, accelerator=computed_again
+    )
     # A ray that ends at infinity may meet a surface there, but nothing beyond it.
     is_in_front = hold(ray[0][:, 2] + hit.time * ray[1][:, 2]) <= 0
     hit = hit._replace(mask=hit.mask & rays.inside & is_in_front)
     is_behind_gap = _comes_through_gap(hold(inverse_depth), *hold(ray), hit, hole_threshold)
     point = patch_point(inverse_depth, *ray, hit, hole_threshold, origin_at_end=True)
-    x, y, z = jnp.moveaxis(point.position, -1, 0)
+    x, y, z = (point.position[:, k] for k in range(3))
     column, row = (
         jnp.clip(jnp.floor(v), 0, size - 1).astype(jnp.int32)
         for v, size in ((x, width), (y, height))

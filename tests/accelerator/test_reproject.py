@@ -38,7 +38,9 @@ def test_every_ray_meets_what_a_walk_over_every_texel_meets(shape):
 
 def test_parts_of_a_target_are_blended_as_each_source_is_warped(monkeypatch):
     """In parts of which none is as long as a row, and the last is not full."""
-    monkeypatch.setattr(importlib.import_module("jaxfx.reproject.blend"), "_RAYS_AT_ONCE", 27)
+    blending = importlib.import_module("jaxfx.reproject.blend")
+    monkeypatch.setattr(blending, "_RAYS_AT_ONCE", 27)
+    monkeypatch.setattr(blending, "_WHOLE_PIXELS", 2)
     rng = np.random.default_rng(0)
     depth, image = rng.uniform(2, 2.1, (9, 11)), rng.random((9, 11, 3))
     there, pose = PinholeCamera.from_fov(0.9, height=9, width=11), np.eye(4)

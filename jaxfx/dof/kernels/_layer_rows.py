@@ -34,7 +34,7 @@ from jaxfx.dof.kernels._compositing import (
 )
 from jaxfx.dof.kernels._slices import APART, Extent, Sheets, across_of, share_of, share_slope_of
 from jaxfx.dof.kernels._taps import inside
-from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, together, windows
+from jaxfx.dof.kernels._windows import in_turns, summed, together, windows
 from jaxfx.dof.sprites import segment_integral
 
 
@@ -99,13 +99,10 @@ def _each_group(
     sheets: Sheets,
     visit: Callable[..., Any],
     state: Any,
-    *,
-    apart: bool = False,
 ) -> Any:
     """Fold `visit(sheet, number, first, arriving, reach, state)` over groups, from the front.
 
     `first` is the number of the group's first slice, `arriving` are the sums of each of them.
-    With `apart` a kernel sums no more than two planes of one slice.
     """
     for number in range(len(sheets.radius)):
         sheet = jax.tree.map(lambda x, n=number: x[n], sheets)
@@ -121,7 +118,7 @@ def _each_group(
             def add_group(k, state, run=(start, reach), wide=wide, sheet=sheet, n=number):
                 start, reach = run
                 first = start + k * GROUP
-                arriving = _arriving(extent, wide, first, reach, apart)
+                arriving = _arriving(extent, wide, first, reach)
                 return visit(sheet, n, first, arriving, reach, state)
 
             # One run after the other, or all of them would take memory at once.
@@ -141,23 +138,21 @@ def _padded(extent: Extent, sheet: Sheets) -> Sheets:
 
 def _below(extent: Extent) -> int:
     """The most rows of offsets that only fill up a turn."""
-    return 2 * in_turns(2 * extent.reach + 1, ROWS)[0]
+    return in_turns(2 * extent.reach + 1, ROWS)[0]
 
 
 # Compiled: groups of one size and reach, before and behind the focus, are traced once.
-@ft.partial(jax.jit, static_argnames=("extent", "reach", "apart"))
+@ft.partial(jax.jit, static_argnames=("extent", "reach"))
 def _arriving(
     extent: Extent,
     sheet: Sheets,
     first: Int[Array, ""],
     reach: int,
-    apart: bool,
 ) -> Float[Array, "slice value height width"]:
     """Sums of the sprites of each slice of a group, per pixel of the frame.
 
-    `sheet` is one of `_padded`, `apart` as `_each_group` has it.
+    `sheet` is one of `_padded`.
     """
-    slices, planes = (1, 2) if apart else (GROUP, AT_ONCE)
     across, dtype = across_of(reach), sheet.radius.dtype
     (turns, rows), columns = in_turns(2 * reach + 1, ROWS), 2 * across + 1
     above, beside = extent.reach - reach, across_of(extent.reach) - across
@@ -182,23 +177,20 @@ def _arriving(
         row = (reach - index * rows - jnp.arange(rows)).astype(dtype)
         span = jax.vmap(_half_width)(near(sheet.radius), row)
         moved = near(sheet.tilt[0]) * span * span / 3
-        ends, added = (moved - span, moved + span), []
-        for k in range(0, values, planes):
-            of_slices = []
-            for first_slice in range(0, GROUP, slices):
-                # Kept in memory; apart for each kernel, or all would share what covers a tap.
-                ends = jax.lax.optimization_barrier(ends)
-                start, end = (windows(x, -1, columns) for x in ends)
-                cover = clip01(end + edge) - clip01(start + edge)
-                facing = 1 + there(sheet.tilt[1]) * row[:, None, None, None]
-                some = shares[first_slice : first_slice + slices]
-                weights = [cover * (share * facing) for share in there(some)]
-                light = there(sheet.value[k : k + planes])
-                terms = [weight * x for weight in weights for x in light]
-                of_slices += summed(terms, (0, 2))
-            found = jnp.stack(of_slices)
-            added.append(found.reshape(GROUP, -1, height, width))
-        return sums + jnp.concatenate(added, axis=1)
+        # Kept in memory.
+        ends = jax.lax.optimization_barrier([moved - span, moved + span])
+        ends = [windows(x, -1, columns) for x in ends]
+        rows_and_tilt = row[:, None, None, None], there(sheet.tilt[1])
+        light = [there(x) for x in shares], [there(x) for x in sheet.value]
+        found = summed(term, (ends, edge, *rows_and_tilt, *light), (0, 2))
+        return sums + jnp.stack(found).reshape(sums.shape)
+
+    def term(ends, edge, row, tilt_y, shares, value):
+        start, end = ends
+        cover = clip01(end + edge) - clip01(start + edge)
+        facing = 1 + tilt_y * row
+        weights = [cover * (share * facing) for share in shares]
+        return [weight * x for weight in weights for x in value]
 
     # Made here, or those of all groups would be made at once.
     shares, zero = share_of(_away(sheet, first)), jnp.zeros((), dtype)
@@ -226,9 +218,7 @@ def record(
     return recorded(_each_group(extent, sheets, add, nothing_filled(extent, sheets)))
 
 
-def forward(
-    extent: Extent, sheets: Sheets, *, apart: bool = False
-) -> Float[Array, "twice_value height width"]:
+def forward(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
     """Light and, last, how much of the lens it fills; then the same weighted."""
 
     def add(_sheet, _number, _first, arriving, _reach, state):
@@ -238,14 +228,14 @@ def forward(
 
     nothing = nothing_filled(extent, sheets).light
     state = nothing, nothing
-    return jnp.concatenate(_each_group(extent, sheets, add, state, apart=apart))
+    return jnp.concatenate(_each_group(extent, sheets, add, state))
 
 
 def tangent(
     extent: Extent, sheets: Sheets, dot: Sheets
 ) -> Float[Array, "twice_value height width"]:
     """The derivative of `forward` along `dot`: its loops are short enough for JAX's own."""
-    return jax.jvp(ft.partial(forward, extent, apart=True), (sheets,), (dot,))[1]
+    return jax.jvp(ft.partial(forward, extent), (sheets,), (dot,))[1]
 
 
 def adjoint(
@@ -279,7 +269,10 @@ def _read_back(
     reach: int,
     bars: list[Float[Array, "value height width"]],
 ) -> Sheets:
-    """The adjoint of `_arriving` at `bars`, one for each slice of the group."""
+    """The adjoint of `_arriving` at `bars`, one for each slice of the group.
+
+    It is one sum over the taps: a sprite weights what is seen of all slices by its shares.
+    """
     far, across = extent.reach, across_of(reach)
     (turns, rows), taps = in_turns(2 * reach + 1, _ROWS_BACK), 2 * across + 1
     high, wide = sheet.radius.shape
@@ -288,6 +281,7 @@ def _read_back(
     pad = [(0, 0), (far + reach, below), (far + across, far + across)]
     edge = jnp.asarray(across + 0.5 - np.arange(taps)[None, None, :, None], dtype)
     at_pixel = lambda x: x[None, :, None]
+    of_sprite = lambda value, planes: ft.reduce(jnp.add, map(jnp.multiply, value, planes))
     # Kept in memory.
     operands = sheet, share_of(_away(sheet, first)), [jnp.pad(bar, pad) for bar in bars]
     sheet, shares, seen = jax.lax.optimization_barrier(operands)
@@ -305,50 +299,40 @@ def _read_back(
             )
             return windows(windows(near, -2, rows), -1, taps)
 
-        of_sprite = lambda value, planes: ft.reduce(jnp.add, map(jnp.multiply, value, planes))
+        # Kept in memory.
+        kept = jax.lax.optimization_barrier([moved - span, moved + span, slope])
+        kept = [x[:, :, None] for x in kept]
+        bars = [[there(x) for x in bar] for bar in seen]
+        # Summed over slices: as they weight the sprite's light, and as the place does.
+        mixed = [of_sprite(shares, planes) for planes in zip(*bars, strict=True)]
+        moving = of_sprite(slopes, [of_sprite(value, bar) for bar in bars])
+        inputs = kept, edge, row, tilt, value, mixed, moving
+        return sums + jnp.stack(summed(term, inputs, (0, 2)))
 
-        def of_light(kept, sheet, away, seen):
-            """The cotangents of value, of the tilt along y and of the place."""
-            start, end = (x[:, :, None] + edge for x in kept[:2])
-            cover = clip01(end) - clip01(start)
-            covered = [cover * x for x in there(seen)]
-            # Of all rows, two sums tell what a tilt along y weights them by.
-            found = summed([term for x in covered for term in (x, row * x)], (0, 2))
-            level, by_row = found[::2], found[1::2]
-            tilted = [x + sheet.tilt[1] * y for x, y in zip(level, by_row, strict=True)]
-            share = share_of(away)
-            of_tilt_y = share * of_sprite(sheet.value, by_row)
-            of_place = share_slope_of(away) * of_sprite(sheet.value, tilted)
-            return share[None] * jnp.stack(tilted), of_tilt_y, of_place
+    def term(kept, edge, row, tilt, value, mixed, moving):
+        """The cotangents of value, place, tilt and radius."""
+        start, end, slope = kept
+        cover = clip01(end + edge) - clip01(start + edge)
+        facing = 1 + tilt[1] * row
+        light = of_sprite(value, mixed)
+        # The tilt along x and the radius move the ends.
+        at_end, at_start = inside(end + edge), inside(start + edge)
+        # Both ends are moved by a third of the tilt times half their distance squared.
+        distance = end - start
+        moved = facing * (at_end - at_start) * distance
+        grown = slope * (facing * (at_end + at_start) + moved * tilt[0] / 3)
+        of_value = [facing * cover * x for x in mixed]
+        of_tilt = moved * distance * light / 12, row * cover * light
+        return of_value, facing * cover * moving, of_tilt, grown * light
 
-        def of_ends(kept, sheet, shares, seen):
-            """The cotangents of the tilt along x and of the radius: both move the ends."""
-            start, end, slope = (x[:, :, None] for x in kept)
-            at_end, at_start = inside(end + edge), inside(start + edge)
-            value = [*map(at_pixel, sheet.value)]
-            light = of_sprite(map(at_pixel, shares), [of_sprite(value, there(x)) for x in seen])
-            # Both ends are moved by a third of the tilt times half their distance squared.
-            distance, third = end - start, at_pixel(sheet.tilt[0] / 3)
-            facing = 1 + at_pixel(sheet.tilt[1]) * row
-            moved = facing * (at_end - at_start) * distance
-            grown = slope * (facing * (at_end + at_start) + moved * third)
-            of_tilt_x, of_radius = summed([moved * distance, grown], (0, 2), light)
-            return of_tilt_x / 12, of_radius
-
-        kept, found = (moved - span, moved + span, slope), [*sums]
-        each_slice = zip(_away(sheet, first), seen, strict=True)
-        alone = [(of_light, slice(3), each) for each in each_slice]
-        for of_kernel, planes, data in (*alone, (of_ends, slice(3, 5), (shares, seen))):
-            # Kept in memory; and apart for each kernel, or all would share what covers a tap.
-            operands = kept, sheet, *data, found
-            kept, *of_taps, found = jax.lax.optimization_barrier(operands)
-            found[planes] = map(jnp.add, found[planes], of_kernel(kept, *of_taps))
-        return found
-
-    zero = jnp.zeros((high, wide), dtype)
-    sums = [jnp.zeros_like(sheet.value), *[zero] * 4]
-    of_value, of_tilt_y, of_place, of_tilt_x, of_radius = fori_loop(0, turns, turn, sums)
-    found = Sheets(of_value, of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)
+    away = _away(sheet, first)
+    slopes = share_slope_of(away)
+    tilt, value, shares, slopes = (
+        [at_pixel(x) for x in planes] for planes in (sheet.tilt, sheet.value, shares, slopes)
+    )
+    nothing = jnp.zeros((len(sheet.value) + 4, high, wide), dtype)
+    *of_value, of_place, of_tilt_x, of_tilt_y, of_radius = fori_loop(0, turns, turn, nothing)
+    found = Sheets(jnp.stack(of_value), of_radius, jnp.stack([of_tilt_x, of_tilt_y]), of_place)
     # As forward has it: what is not let through passes no derivative.
     return jax.tree.map(lambda x: jnp.where(sheet.value[-1] > 0, x, 0), found)
 

@@ -1,7 +1,7 @@
 """Scatter as a gather, by rows of offsets, each over the whole image.
 
 For devices on which a launch costs more than what it computes: a turn of the loop adds all taps
-of several rows in a kernel or two (`_windows`). The turns are as many as the largest sprite has
+of several rows in one kernel (`_windows`). The turns are as many as the largest sprite has
 rows, which is known when the program is compiled: the host looks at no result. The adjoint is
 the same sweep, owned by the sources: no scatter is left.
 
@@ -10,7 +10,6 @@ the image holds.
 """
 
 import functools as ft
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +23,7 @@ from jaxfx._platform import one_direction_at_a_time
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._taps import Sweep, inside
-from jaxfx.dof.kernels._windows import AT_ONCE, in_turns, summed, together, windows
+from jaxfx.dof.kernels._windows import in_turns, summed, together, windows
 from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 
 
@@ -48,8 +47,6 @@ def _sums(
     own, other = _listed(own), _listed(other)
     shapes = jax.eval_shape(tap, *[radius] * (2 if slopes else 1), own, other)
     planes, tree = jax.tree.flatten(shapes)
-    # Derivatives in the target share with the value what takes long to compute.
-    kernels = _kernels(shapes, 2 if slopes and not by_source else AT_ONCE)
     taps = 2 * reach + 1
     turns, rows = in_turns(taps, _ROWS)
     # Of the pixel in the middle both halves are covered.
@@ -78,41 +75,25 @@ def _sums(
             ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0)
         )
         spans = half_widths(sprite if by_source else at_rows(sprite), row)
-        added = []
-        for kernel in kernels:
-            # Else what several kernels share would be kept, for every tap.
-            spans, own, other = jax.lax.optimization_barrier((spans, at_pixel, there))
-            wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
-            passed = factor * wide[0] + shift
-            covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
-            near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), other)
-            terms = jax.tree.leaves(tap(*covers, own, near))
-            added += summed([terms[k] for k in kernel], (0, 2))
-        return [*map(jnp.add, sums, added)]
+        # Kept in memory.
+        spans = jax.lax.optimization_barrier(spans)
+        wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
+        near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), there)
+        inputs = wide, factor, shift, at_pixel, near
+        return sums + jnp.stack(summed(term, inputs, (0, 2)))
 
-    sums = fori_loop(0, turns, turn, [jnp.zeros_like(radius) for _ in planes])
-    sums = jax.tree.unflatten(tree, sums)
+    def term(wide, factor, shift, own, other):
+        passed = factor * wide[0] + shift
+        covers = [_clip(passed), *(inside(passed) * factor * x for x in wide[1:])]
+        return tap(*covers, own, other)
+
+    nothing = jnp.stack([jnp.zeros_like(radius) for _ in planes])
+    sums = jax.tree.unflatten(tree, [*fori_loop(0, turns, turn, nothing)])
     return [jnp.stack(x) if isinstance(x, list) else x for x in sums]
 
 
-def _kernels(outputs: list[Any], most: int) -> list[list[int]]:
-    """Indices of the planes that each kernel sums.
-
-    The planes of a stack share one weight per tap: at most `most` of them go into a kernel.
-    Planes outside of stacks share more than a weight. Two of them, as one complex array, are
-    summed without writing the shared values to memory; with more XLA would write them.
-    """
-    kernels, first = [], 0
-    for stands_alone, alike in itertools.groupby(outputs, lambda x: not isinstance(x, list)):
-        for planes in [[*alike]] if stands_alone else alike:
-            last, step = first + len(planes), 2 if stands_alone else most
-            kernels += [[*range(k, min(k + step, last))] for k in range(first, last, step)]
-            first = last
-    return kernels
-
-
 def _listed(planes: list[Array]) -> list[Any]:
-    """Stacks as lists of planes: XLA then adds to all of them in one kernel."""
+    """Stacks as lists of planes: `summed` takes one number of each plane."""
     return [[*x] if x.ndim == 3 else x for x in planes]
 
 

@@ -1,14 +1,13 @@
 """Sums over all taps of a window, as one loop inside one kernel, for accelerators.
 
-`windows` gives every element its window by arithmetic on indices, and `summed` adds terms that
-are made of such windows. XLA for a GPU then makes one loop of both, whose sums stay in
-registers: it takes a moment to compile, however many taps there are, and nothing but the sums
-is written to memory.
+`windows` gives every element its window by arithmetic on indices, and `summed` adds up a term
+of such windows. XLA for a GPU makes one loop of both, whose sums stay in registers: it takes a
+moment to compile, however many taps there are, and nothing but the sums is written to memory.
 
-XLA does so where it reckons that this is quicker than to keep what several sums share. It takes
-each array that is summed to compute all that it depends on by itself. Hence two planes make one
-complex array, no more than `AT_ONCE` planes are summed at once, and what is long to compute is
-kept in memory before. See `docs/design/xla.md`.
+What several sums share, as the coverage of a tap, XLA would compute for each of them, or keep
+in memory for every tap, as it reckons: above some size of an image, it keeps. So `summed` has
+the term inside the addition of its one reduction, where XLA sees nothing that is shared. See
+`docs/design/xla.md`.
 """
 
 import functools as ft
@@ -19,10 +18,6 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Shaped
-
-
-# Planes that are summed at once. With more, XLA keeps the weight of every tap in memory.
-AT_ONCE = 4
 
 
 def windows(x: Shaped[Array, "..."], axis: int, count: int) -> Shaped[Array, "..."]:
@@ -41,43 +36,53 @@ def windows(x: Shaped[Array, "..."], axis: int, count: int) -> Shaped[Array, "..
 
 
 def summed(
-    terms: list[Float[Array, "..."]],
-    axes: tuple[int, ...],
-    factor: Float[Array, "..."] | None = None,
+    term: Callable[..., Any], inputs: tuple[Any, ...], axes: tuple[int, ...]
 ) -> list[Float[Array, "..."]]:
-    """The sum of each of some arrays of one shape over these axes, the first of even length.
+    """The sums of `term(*inputs)` over these axes, one for each number that it gives.
 
-    `factor` multiplies every term; what takes long to compute is then computed once for two.
+    `inputs` are trees of arrays of one dtype that broadcast together; `term` is given one
+    element of each. A plane of memory is taken for each input or each sum, whichever are more:
+    what is used once is better computed before.
     """
-    paired = len(terms) // 2 * 2
-    arrays = [*map(jax.lax.complex, terms[:paired:2], terms[1:paired:2]), *terms[paired:]]
-    if factor is not None:
-        arrays = [x * factor.astype(x.dtype) for x in arrays]
-    if len(arrays) == 1:
-        # The sum of a single array XLA would cut in two, one after the other.
-        first, second = _summed(jnp.split(arrays[0], 2, axes[0]), axes)
-        sums = [first + second]
-    else:
-        sums = _summed(arrays, axes)
-    pairs = sums[: paired // 2]
-    return [part for x in pairs for part in (x.real, x.imag)] + sums[len(pairs) :]
+    leaves, tree = jax.tree.flatten(inputs)
+    shape = jnp.broadcast_shapes(*(x.shape for x in leaves))
+    of_leaves = lambda *leaves: jax.tree.leaves(term(*jax.tree.unflatten(tree, leaves)))
+    return _summed([jnp.broadcast_to(x, shape) for x in leaves], of_leaves, axes)
 
 
-@ft.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _summed(terms, axes):
-    zeros = [jnp.zeros((), x.dtype) for x in terms]
-    return jax.lax.reduce(terms, zeros, lambda x, y: [*map(jnp.add, x, y)], axes)
+@ft.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _summed(leaves, term, axes):
+    """What is added is a flag and some numbers: the inputs of a term, or sums of terms."""
+    dtype = leaves[0].dtype
+    count = len(jax.eval_shape(term, *[jax.ShapeDtypeStruct((), dtype)] * len(leaves)))
+    numbers = leaves + [jnp.zeros_like(leaves[0])] * (count - len(leaves))
+
+    def sums_of(is_term, *numbers):
+        terms = term(*numbers[: len(leaves)])
+        return [jnp.where(is_term, *pair) for pair in zip(terms, numbers[:count], strict=True)]
+
+    def add(one, other):
+        sums = [*map(jnp.add, sums_of(*one), sums_of(*other))]
+        # Constants, as where the loop begins: so XLA sees that its sums are never a term.
+        return [jnp.zeros((), bool), *sums, *[jnp.zeros((), dtype)] * (len(numbers) - count)]
+
+    operands = [jnp.ones_like(leaves[0], bool), *numbers]
+    nothing = [jnp.zeros((), x.dtype) for x in operands]
+    return jax.lax.reduce(operands, nothing, add, axes)[1 : 1 + count]
 
 
 @_summed.defjvp
-def _(axes, primals, tangents):
-    return _summed(*primals, axes), _summed(*tangents, axes)
+def _(term, axes, primals, tangents):
+    (leaves,), (dots,) = primals, tangents
+    count = len(leaves)
+    tangent = lambda *both: jax.jvp(term, both[:count], both[count:])[1]
+    return _summed(leaves, term, axes), _summed([*leaves, *dots], tangent, axes)
 
 
 def in_turns(offsets: int, most: int) -> tuple[int, int]:
-    """In how many turns offsets are visited, and how many in each: an even number."""
+    """In how many turns offsets are visited, and how many in each."""
     turns = -(-offsets // most)
-    return turns, -(-offsets // (2 * turns)) * 2
+    return turns, -(-offsets // turns)
 
 
 def together(function: Callable[..., Any]) -> Callable[..., Any]:
