@@ -23,8 +23,6 @@
 # has to be given that back.
 
 # %%
-import time
-
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -42,7 +40,6 @@ BORDER, FINE = 16, 4
 LAMPS = np.array(
     [[1, 0.62, 0.25], [1, 0.8, 0.5], [0.9, 0.95, 1], [1, 0.25, 0.12], [0.25, 1, 0.6]]
 )
-begun = time.perf_counter()
 
 
 def city(rng, height, width, lamps, spread):
@@ -263,8 +260,9 @@ for name in ("yes or no", "alpha"):
 #
 # Towards the corners the rim of a fast lens cuts the opening, and discs turn into cat's eyes
 # that seem to swirl about the middle. `vignetting` is how far the rim has moved at the corner,
-# in radii of the opening. Above the truth from 1024 passes, of which each pixel counts those
-# that it sees past the rim, below the effect.
+# in radii of the opening. On the left the truth from 1024 passes, of which each pixel counts
+# those that it sees past the rim, on the right the effect. `margin` says that the image is
+# wider than what is wanted, so that lamps beyond the frame are drawn too.
 
 # %%
 HEIGHT, WIDTH = 144, 216
@@ -377,12 +375,10 @@ print(f"their distance is {100 * np.median(off):.1f} % off in the median")
 #
 # - A matte says how much of a pixel is hair, not which part of the lens the hair leaves free:
 #   where both the hair and what is behind it are blurred, colours are off by a few hundredths.
-# - Without `behind` the city behind the model is guessed. Lamps that she hides are missing.
+# - Without `behind` the city behind the model is guessed, and lamps that she hides are missing.
+#   So are lamps beyond the frame without a `margin`.
 # - A rim takes no light here: corners do not get darker. `Iris.open_share` is by how much they
 #   would.
 # - Lamps that a camera has clipped at white are pale when they spread: raise them first.
 # - Longitudinal colour, astigmatism and coma, which colour and bend the discs of real lenses,
 #   are not modelled.
-
-# %%
-print(f"all of this took {time.perf_counter() - begun:.0f} s")

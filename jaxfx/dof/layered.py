@@ -72,7 +72,8 @@ def layered(
 
     **Arguments:**
 
-    - `image`: height width channel, linear radiance.
+    - `image`: height width channel, linear radiance, of any number of channels. A fourth one is
+      a colour like the others: the alpha of an RGBA image goes in as `alpha=rgba[..., 3]`.
     - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
       or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.

@@ -197,6 +197,29 @@ def test_a_margin_is_left_out_of_the_output(margin):
     assert np.abs(blur(margin=margin) - inside).max() < 1e-9
 
 
+@pytest.mark.full
+def test_rgba_and_disparity_before_a_background_and_its_disparity():
+    """As matting tools have it: straight colours and alpha, blur strength, focus disparity."""
+    front, wall = waves(9), waves(10)
+    matte = np.clip((40 - COLUMN) / 16, 0, 1)
+    rgba = wide(np.concatenate([front, matte[:, None]], axis=1))
+    disparity, behind = np.full(SIZE, 0.9), np.full(SIZE, 0.4)
+    lens = ThinLens.from_disparity(strength=20.0, focus_disparity=0.9)
+    exact = passes([(front, matte, 0), (wall, np.ones(SIZE[1]), 20 * (0.9 - 0.4))])
+    found = dof.layered(
+        rgba[..., :3],
+        1 / disparity,
+        lens,
+        max_coc=12.0,
+        alpha=rgba[..., 3],
+        behind=(wide(wall), 1 / behind),
+    )
+    assert np.abs(found[12] - exact)[8:-8].max() < 0.01
+    # All four as colours: each is what it is by itself, and nothing shows through.
+    four = dof.layered(rgba, 1 / disparity, lens, max_coc=12.0)
+    np.testing.assert_allclose(four, rgba, atol=1e-12)
+
+
 @pytest.mark.parametrize(("pad", "mode"), [("repeat", "edge"), ("reflect", "symmetric")])
 def test_what_lies_beyond_the_frame_is_what_passes_show(pad, mode):
     """Two planes side by side, both out of focus: the first and the last columns."""
