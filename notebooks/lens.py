@@ -371,7 +371,7 @@ print(f"{100 * told.mean():.0f} % of the pixels are told (the others are grey),"
 print(f"their distance is {100 * np.median(off):.1f} % off in the median")
 
 # %% [markdown]
-# ## What no lens of this kind can do
+# ## What none of these lenses can do
 #
 # - A matte says how much of a pixel is hair, not which part of the lens the hair leaves free:
 #   where both the hair and what is behind it are blurred, colours are off by a few hundredths.
