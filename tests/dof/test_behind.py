@@ -214,7 +214,8 @@ def test_rgba_and_disparity_before_a_background_and_its_disparity():
         alpha=rgba[..., 3],
         behind=(wide(wall), 1 / behind),
     )
-    assert np.abs(found[12] - exact)[8:-8].max() < 0.01
+    # As of any soft matte in focus before a wall out of focus.
+    assert np.abs(found[12] - exact)[8:-8].max() < 0.02
     # All four as colours: each is what it is by itself, and nothing shows through.
     four = dof.layered(rgba, 1 / disparity, lens, max_coc=12.0)
     np.testing.assert_allclose(four, rgba, atol=1e-12)
