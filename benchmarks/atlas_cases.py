@@ -158,9 +158,17 @@ def depth_of_field(at: Point) -> Case:
         "layered": {
             "1 layer": of(dof.layered, behind=None),
             "1 layer, 1 guessed": of(dof.layered),
+            "1 layer, 2 guessed": of(dof.layered, behind=("peel", "peel")),
+            "split, 1 guessed": of(dof.layered, mixed="split"),
+            "split, 2 guessed": of(dof.layered, behind=("peel", "peel"), mixed="split"),
             "2 layers": lambda image, depth, lens, behind: dof.layered(
                 image, depth, lens, max_coc=coc, behind=behind
             ),
+        },
+        # The disc by the program of every other iris: the same image, another time.
+        "layered, iris": {
+            "1 layer": of(dof.layered, behind=None, iris=dof.Iris()),
+            "1 layer, 1 guessed": of(dof.layered, iris=dof.Iris()),
         },
         "gather": {f"{n} taps": of(dof.gather, taps=n) for n in (32, 8, 128)},
         "depth sorted": {f"{n} slices": of(dof.depth_sorted, slices=n) for n in (8, 4, 16)},

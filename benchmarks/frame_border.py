@@ -40,15 +40,10 @@ def rows(case):
         blur = ft.partial(dof.layered, lens=lens, max_coc=largest + 0.01)
         image, depth = cut(case.image), cut(case.depth)
         edge = blur(image, depth)
-        mirrored = blur(_mirrored(image), _mirrored(depth), margin=MARGIN)
+        mirrored = blur(image, depth, pad="reflect")
         wide = blur(case.image, case.depth, margin=MARGIN)
         found = [score(picture, border) for picture in (edge, mirrored, wide)]
         yield name, largest, np.array([*found, score(edge, ~border)])
-
-
-def _mirrored(x):
-    """With its mirror image, the last pixel included, by the margin on each side."""
-    return jnp.pad(x, [(MARGIN, MARGIN)] * 2 + [(0, 0)] * (x.ndim - 2), mode="symmetric")
 
 
 def main():

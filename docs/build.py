@@ -35,7 +35,16 @@ MODULES = (
     *("depth", "scene", "exr", "io", "metrics", "tradeoff"),
 )
 GUIDES = (
-    *("depth_of_field", "focal_stack", "blur", "reproject", "shadow", "relight", "fitting"),
+    *(
+        "depth_of_field",
+        "lens",
+        "focal_stack",
+        "blur",
+        "reproject",
+        "shadow",
+        "relight",
+        "fitting",
+    ),
     "charts",
 )
 

@@ -45,6 +45,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "scatter, spans": {"program": "spans"},
     "scatter, indicator": {"program": "segment_sum", "coverage": "indicator"},
     "depth_sorted, all": {"slices": "all"},
+    "layered, split": {"mixed": "split"},
+    "layered, reflect": {"pad": "reflect"},
 }
 
 

@@ -15,7 +15,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._arguments import check_lens
-from jaxfx._checks import as_array, check_depth, check_image, check_shape, is_concrete, number
+from jaxfx._checks import (
+    as_array,
+    check_depth,
+    check_image,
+    check_shape,
+    is_concrete,
+    number,
+    whole_number,
+)
 from jaxfx._numerics import working_dtype
 from jaxfx.lens import FocusPlanes, Lens, ThinLens
 
@@ -37,6 +45,19 @@ def check_arguments(
     is_valid = lambda x: 0 < x < math.inf
     max_coc = number(f"{function}(max_coc=...)", max_coc, is_valid)
     return image, depth, compiled(function, lens, depth), max_coc
+
+
+def check_margin(function: str, margin: Any, depth: Float[Array, "height width"]) -> int:
+    """By how many pixels images are larger on each side than what is returned."""
+    least = min(depth.shape)
+    is_inside = lambda n: n >= 0 and 2 * n < least
+    expected = "an integer from 0, less than half the image"
+    return whole_number(f"{function}(margin=...)", margin, is_inside, expected)
+
+
+def without_margin(x: Array, margin: int) -> Array:
+    """Height and width, first, without the margin."""
+    return x[margin : x.shape[0] - margin, margin : x.shape[1] - margin]
 
 
 class Sampled(eqx.Module):

@@ -310,17 +310,18 @@ class Outline(NamedTuple):
     rings: Float[Array, " ring"] | None = None
 
 
-def outline(iris: Iris, dtype: Any, size: tuple[int, ...] = ()) -> Outline:
+def outline(iris: Iris, dtype: Any, size: tuple[int, ...] = (), margin: int = 0) -> Outline:
     """The pieces of an iris' outline, in `dtype`.
 
-    Per pixel of an image of that `size`, height and width, if the iris has a `vignetting`.
+    Per pixel of an image of that `size`, height and width, if the iris has a `vignetting`. The
+    image is wider by `margin` pixels on each side than what the lens takes.
     """
     iris = jax.tree.map(lambda x: x.astype(dtype), iris)
     whole = _uncut(iris, dtype)._replace(rings=rings_of(iris))
     if iris.vignetting is None:
         return whole
     height, width = size
-    field = field_of(height, width, dtype)
+    field = field_of(height, width, dtype, margin)
     center = center_of(iris.vignetting, field)
     if whole.pieces is None:
         corners, normals = quarters(dtype)

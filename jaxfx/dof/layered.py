@@ -17,7 +17,6 @@ from jaxfx._checks import (
     option,
     parameter,
     share,
-    whole_number,
 )
 from jaxfx._meshes import on_any_mesh
 from jaxfx._xla import sum_planes
@@ -25,9 +24,11 @@ from jaxfx.dof.arguments import (
     OWN,
     Defocused,
     check_arguments,
+    check_margin,
     compiled,
     defocused,
     with_own,
+    without_margin,
 )
 from jaxfx.dof.behind import Behind, Layer, Surface, checked, given, let_through
 from jaxfx.dof.iris import Iris, areas, check_iris, moved, outline
@@ -60,6 +61,7 @@ def layered(
     threshold: Float[ArrayLike, ""] | float = 2.0,
     iris: Iris | None = None,
     margin: WholeNumber = 0,
+    pad: Literal["repeat", "reflect"] = "repeat",
     mixed: Literal["keep", "split"] = "keep",
 ) -> Float[Array, "rows columns channel"]:
     """Depth of field with occlusion: point sprites composited per pixel from front to back.
@@ -70,7 +72,8 @@ def layered(
 
     **Arguments:**
 
-    - `image`: height width channel, linear radiance.
+    - `image`: height width channel, linear radiance, of any number of channels. A fourth one is
+      a colour like the others: the alpha of an RGBA image goes in as `alpha=rgba[..., 3]`.
     - `depth`: height width, scene units along the optical axis, inf for background; 0, negative
       or NaN where it is missing.
     - `lens`: gives each depth its signed defocus, in pixels.
@@ -91,7 +94,11 @@ def layered(
     - `iris`: the shape of the sprites; by default the disc. The program is then another one,
       the same on every device, and slower.
     - `margin`: static; pixels. By so much the images that are given are larger on each side
-      than what is returned, so that nothing has to be guessed there.
+      than what is returned, so that nothing has to be guessed there. The corner of an iris'
+      `vignetting` is that of what is returned.
+    - `pad`: static; what is taken to lie beyond the images, margin included: `"repeat"`, their
+      last pixels, or `"reflect"`, their mirror image. Of 18 images of three scenes the mirror
+      image served two better, by 2 dB, and 16 worse, by 0.1 to 2 dB.
     - `mixed`: static; what becomes of pixels of silhouettes that hold colours of two surfaces
       and the depth of one. `"keep"` takes them as they are; `"split"` makes two sprites of
       them, by an estimate of the share of each. Take `"split"` for antialiased images, such
@@ -103,7 +110,8 @@ def layered(
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
     `threshold`, alpha outside [0, 1] or with `mixed="split"`, an `iris` or a layer that is
-    none, a `margin` that leaves nothing, or no `max_coc` under a transform.
+    none, a `margin` that leaves nothing, an unknown option, or no `max_coc` under a
+    transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `alpha` (at 0 and 1 too), all of
     `behind`, `threshold` and every field of `lens` and `iris`, forward and reverse; of a
@@ -154,15 +162,15 @@ def layered(
     wires of 1 to 3 pixels it gains 1.7 to 8.4 dB, and more with `behind=["peel", "peel"]`; from
     an image that is not antialiased it loses up to 0.6 dB, or 2.8 with two guesses.
 
-    Known limits: what no layer shows is guessed from its surroundings; beyond the frame the
-    last pixels are repeated, so that the border is some 3 dB worse than the inside. Through
-    which part of the lens a soft matte lets light is not known: where both it and what is
-    behind it are blurred by 12 pixels, colours are off by up to 0.05 in a test. Nothing is
-    guessed behind a pixel whose alpha is below 1. Within a slice nothing hides anything. The
-    parts of the lens that two edges hide are added up, even where they overlap. How much of
-    the lens sees a point of a layer behind is that of a disc, whatever the iris. With an iris
-    and float32, a highlight of a hundred million times its surroundings changes them by 2 %
-    along its rows, one of 5000 times by a millionth or two.
+    Known limits: what no layer shows is guessed from its surroundings; what lies beyond the
+    frame is not known, so that the border is some 3 dB worse than the inside. Through which
+    part of the lens a soft matte lets light is not known: where both it and what is behind it
+    are blurred by 12 pixels, colours are off by up to 0.05 in a test. Nothing is guessed behind
+    a pixel whose alpha is below 1. Within a slice nothing hides anything. The parts of the lens
+    that two edges hide are added up, even where they overlap. How much of the lens sees a point
+    of a layer behind is that of a disc, whatever the iris. With an iris and float32, a
+    highlight of a hundred million times its surroundings changes them by 2 % along its rows,
+    one of 5000 times by a millionth or two.
 
     Source: developed for this library. Related: Lee, Kim & Choi 2008 and Franke et al. 2018
     composite layers per pixel or per tile; compositing of premultiplied colours ("over") is
@@ -172,11 +180,8 @@ def layered(
     image, depth, lens, max_coc = check_arguments("layered", image, depth, own, max_coc)
     threshold = parameter("layered(threshold=...)", threshold)
     check("layered(threshold=...)", threshold, lambda v: v >= 0, "0 or positive")
-    least = min(depth.shape)
-    is_inside = lambda n: n >= 0 and 2 * n < least
-    margin = whole_number(
-        "layered(margin=...)", margin, is_inside, "an integer from 0, less than half the image"
-    )
+    margin = check_margin("layered", margin, depth)
+    option("layered(pad=...)", pad, ("repeat", "reflect"))
     pure, known = image, depth
     parts: Split | None = None
     if option("layered(mixed=...)", mixed, ("keep", "split")) == "split":
@@ -211,20 +216,23 @@ def layered(
     extent = Extent(max_coc, slices)
     if iris is not None:
         iris = check_iris("layered(iris=...)", iris)
-    return _layered(
-        Layer(image, depth, lens, alpha), extent, tuple(layers), threshold, iris, margin
-    )
+    layer = Layer(image, depth, lens, alpha)
+    return _layered(layer, extent, tuple(layers), threshold, iris, margin, pad)
 
 
-@ft.partial(jax.jit, static_argnames=("extent", "margin"))
-def _layered(first, extent, behind, threshold, iris, margin):
+@ft.partial(jax.jit, static_argnames=("extent", "margin", "pad"))
+def _layered(first, extent, behind, threshold, iris, margin, pad):
     max_coc = extent.max_coc
+    beyond = extent.reach - margin
+    if pad == "reflect" and beyond > 0:
+        first, *behind = (_mirrored(layer, beyond) for layer in (first, *behind))
+        margin += beyond
     view, alpha = _seen_alone(first, max_coc)
     threshold = jnp.maximum(threshold.astype(view.image.dtype), max_coc / SLICES)
     shape, area = None, math.pi
     if iris is not None:
         dtype = view.image.dtype
-        shape = outline(iris, dtype, view.defocus.shape)
+        shape = outline(iris, dtype, view.defocus.shape, margin)
         area = iris.area().astype(dtype) if shape.rim is None else areas(shape)
     opaque = jnp.ones_like(view.defocus) if alpha is None else _painted(alpha)
     through = jnp.where(view.missing, 0, opaque)
@@ -254,7 +262,7 @@ def _layered(first, extent, behind, threshold, iris, margin):
     else:
         sums = _layer_chords.composited(extent, sheets, moved(shape, framed))
     light, late = jnp.split(jnp.moveaxis(sums, 0, -1), 2, axis=-1)
-    inside = lambda x: _inside(x, margin)
+    inside = lambda x: without_margin(x, margin)
     own = inside(view.image)
     late = with_own(late, own, inside(view.missing))
     if alpha is not None:
@@ -296,16 +304,23 @@ def _painted(alpha: Float[Array, "height width"]) -> Float[Array, "height width"
     return jnp.where(alpha > 0, alpha, at_zero)
 
 
-def _inside(x: Array, margin: int) -> Array:
-    """Height and width, first, without the margin."""
-    return x[margin : x.shape[0] - margin, margin : x.shape[1] - margin]
-
-
 def _framed(x: Float[Array, "*plane height width"], beyond: int) -> Array:
     """A plane with its last pixels repeated, `beyond` times; cut off where it is negative."""
     if beyond < 0:
         return x[..., -beyond:beyond, -beyond:beyond]
     return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(beyond, beyond)] * 2, mode="edge")
+
+
+def _mirrored(layer: Layer, beyond: int) -> Layer:
+    """A layer with its mirror image around it, the last pixels included."""
+
+    def wider(x):
+        if x.shape[:2] != layer.depth.shape:
+            return x  # A number of the lens.
+        width = [(beyond, beyond)] * 2 + [(0, 0)] * (x.ndim - 2)
+        return jnp.pad(x, width, mode="symmetric")
+
+    return jax.tree.map(wider, layer)
 
 
 def _sheet(

@@ -36,10 +36,20 @@ class Rim(NamedTuple):
     end_area: Float[Array, "arc height width"]
 
 
-def field_of(height: int, width: int, dtype: Any) -> Float[Array, "2 height width"]:
-    """Where each pixel's centre lies from the image's, in halves of the diagonal, x and y."""
-    along = lambda n: (2 * jnp.arange(n, dtype=dtype) + (1 - n)) / math.hypot(height, width)
-    return jnp.stack(jnp.meshgrid(along(width), along(height)))
+def field_of(
+    height: int, width: int, dtype: Any, margin: int = 0
+) -> Float[Array, "2 height width"]:
+    """Where each pixel's centre lies from the image's, in halves of the diagonal, x and y.
+
+    The frame has a `margin` around it, which belongs to the height and the width. Where that
+    lies farther off than a corner of the frame it counts as that far, in its direction.
+    """
+    diagonal = math.hypot(height - 2 * margin, width - 2 * margin)
+    along = lambda n: (2 * jnp.arange(n, dtype=dtype) + (1 - n)) / diagonal
+    field = jnp.stack(jnp.meshgrid(along(width), along(height)))
+    if margin == 0:
+        return field
+    return field / jnp.maximum(jnp.sqrt(jnp.sum(field * field, axis=0)), 1)[None]
 
 
 def center_of(

@@ -10,10 +10,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import Number, check, is_concrete, option, parameter
+from jaxfx._checks import (
+    Number,
+    WholeNumber,
+    check,
+    is_concrete,
+    option,
+    parameter,
+)
 from jaxfx._meshes import on_any_mesh
 from jaxfx._platform import either
-from jaxfx.dof.arguments import check_arguments, largest_of, pixels, with_own
+from jaxfx.dof.arguments import (
+    check_arguments,
+    check_margin,
+    largest_of,
+    pixels,
+    with_own,
+    without_margin,
+)
 from jaxfx.dof.iris import Iris, areas, check_iris, outline
 from jaxfx.dof.kernels._adjoint import with_adjoint
 from jaxfx.dof.kernels._chords import Shaped, near_reach, painted, taps
@@ -57,9 +71,10 @@ def scatter(
     epsilon: Float[ArrayLike, ""] | float = 2.0,
     max_coc: Number | None = None,
     iris: Iris | None = None,
+    margin: WholeNumber = 0,
     program: Program = "auto",
     coverage: Coverage = "area",
-) -> Float[Array, "height width channel"]:
+) -> Float[Array, "rows columns channel"]:
     """Depth of field by point sprites: every pixel is spread over its circle of confusion.
 
     It is the method whose `gamma` and `epsilon` are fitted to a scene (`fit.dof`), with exact
@@ -79,6 +94,9 @@ def scatter(
     - `iris`: the shape of the sprites; by default the disc. It goes with the programs `"auto"`,
       `"shift"` and `"spans"`, which then are others than for the disc, the same on every
       device, and slower.
+    - `margin`: static; pixels. By so much the images that are given are larger on each side
+      than what is returned: what lies beyond the frame is not in its border else. The corner of
+      an iris' `vignetting` is that of what is returned.
     - `program`: which program computes the sums; the result is the same. `"segment_sum"` writes
       every tap out (the oracle, memory in pixels times taps), `"shift"` adds one shifted image
       an offset, `"tiles"` does so tile by tile, each only as far as the sprites that reach it,
@@ -90,13 +108,13 @@ def scatter(
     - `coverage`: `"area"`, the exact area of the disc in each row of pixels, or `"indicator"`,
       the paper's own, 1 where a pixel's centre lies inside (`"segment_sum"` only).
 
-    **Returns:** height width channel, in the type of `image`. A pixel whose colour is not a
-    number spoils what its sprite can reach, and no more. One whose depth is missing has no
-    sprite: it shows what reaches it or, where nothing does, its own colour.
+    **Returns:** height width channel, without the margin, in the type of `image`. A pixel whose
+    colour is not a number spoils what its sprite can reach, and no more. One whose depth is
+    missing has no sprite: it shows what reaches it or, where nothing does, its own colour.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative `gamma` or
-    `epsilon`, an unknown option, a program that does not take an iris, or no `max_coc` under a
-    transform.
+    `epsilon`, an unknown option, a program that does not take an iris, a `margin` that leaves
+    nothing, or no `max_coc` under a transform.
 
     **Gradient:** exact with respect to `image`, `depth`, `gamma`, `epsilon` and every field of
     `lens` and `iris`, silhouettes included, forward and reverse; again by
@@ -135,6 +153,7 @@ def scatter(
     epsilon = parameter("scatter(epsilon=...)", epsilon)
     check("scatter(gamma=...)", gamma, lambda v: v >= 0, "0 or positive")
     check("scatter(epsilon=...)", epsilon, lambda v: v >= 0, "0 or positive")
+    margin = check_margin("scatter", margin, depth)
     option("scatter(program=...)", program, get_args(Program))
     option("scatter(coverage=...)", coverage, tuple(COVERAGES))
     if coverage == "indicator" and program != "segment_sum":
@@ -144,7 +163,8 @@ def scatter(
         )
     if iris is not None:
         iris = check_iris("scatter(iris=...)", iris)
-        return _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program)
+        shaped = _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program, margin)
+        return without_margin(shaped, margin)
     if program == "auto":
         # From the data where they can be looked at, else from what they may hold; the programs
         # themselves go no farther, tile by tile, than what they do hold.
@@ -154,7 +174,8 @@ def scatter(
         programs = cheapest(height, width, room), "rows"
     else:
         programs = program, program
-    return _scatter(image, depth, lens, gamma, epsilon, max_coc, programs, coverage)
+    result = _scatter(image, depth, lens, gamma, epsilon, max_coc, programs, coverage)
+    return without_margin(result, margin)
 
 
 def to_sprites(
@@ -279,7 +300,7 @@ def _scatter(image, depth, lens, gamma, epsilon, max_coc, programs, coverage):
 _FEW_ROWS = 4
 
 
-def _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program):
+def _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program, margin):
     """`scatter` by sprites of another shape than the disc."""
     if program not in ("auto", "shift", "spans"):
         raise ValueError(
@@ -293,17 +314,17 @@ def _with_iris(image, depth, lens, iris, gamma, epsilon, max_coc, program):
     near = None
     if program == "spans":
         near = near_reach(float(epsilon), max_coc) if is_known else reach(max_coc)
-    return _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near)
+    return _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near, margin)
 
 
-@ft.partial(jax.jit, static_argnames=("max_coc", "near"))
-def _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near):
+@ft.partial(jax.jit, static_argnames=("max_coc", "near", "margin"))
+def _scatter_shape(image, depth, lens, iris, gamma, epsilon, max_coc, near, margin):
     """By `taps` or, where it is known how far those that stay taps go, by `painted`."""
     seen = pixels(image, depth, lens)
     dtype = seen.image.dtype
     rematerialised = jax.checkpoint(to_sprites, static_argnums=5)
     operands = seen.image, seen.depth, lens, gamma, epsilon, max_coc, seen.missing
-    shape = outline(iris, dtype, seen.depth.shape)
+    shape = outline(iris, dtype, seen.depth.shape, margin)
     area = iris.area().astype(dtype) if shape.rim is None else areas(shape)
     sprites = rematerialised(*operands, area)
     side = jnp.where(lens.defocus(seen.depth) < 0, -1, 1).astype(dtype)

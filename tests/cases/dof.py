@@ -2,25 +2,29 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from benchmarks.scenes.dof import (
     CAMERA,
     FLAT,
     LENS,
+    MAX_COC,
     METHODS,
     MIDDLE,
     RADIUS,
     SIZE,
     blurred,
+    covered,
     derivative,
     in_float32,
     off_quotients,
     random_picture,
     scenes,
 )
-from jaxfx import ThinLens
+from jaxfx import ThinLens, dof
 from tests.cases.registry import Found, case
 
 
@@ -238,3 +242,115 @@ def ambiguous_order(method):
         depth = np.where(column < MIDDLE, 1.2, 2.0 + sign * 1e-9 * turn)
         images.append(np.asarray(blurred(method)(image, depth, ThinLens(0.3, 4.0, 66.0))))
     return Found({"jump": float(np.abs(images[1] - images[0]).max())}, images[1])
+
+
+# A lens in focus at depth 1 and one at 2, with circles of twice the radius at the other.
+NEAR_FOCUS, FAR_FOCUS = (ThinLens(1.0, focus, 4 * RADIUS) for focus in (1.0, 2.0))
+
+
+@case(
+    "dof",
+    {"rms in the band": 0.02},
+    ("scatter", "layered, one layer", "layered", "layered, true second"),
+    {"layered": GUESSED, "layered, true second": "exact"}
+    | dict.fromkeys(("scatter", "layered, one layer"), ONE_LAYER),
+)
+def hidden_stripe(method):
+    """White, near and blurred, before black in focus with a bright stripe, all of which it
+    hides: rms error in the band of one radius about the edge. No guess knows of the stripe."""
+    x = np.arange(SIZE) + 0.5 - MIDDLE
+    wall = np.where((x > -4) & (x < -1), 0.8, 0.0)
+    hides = covered(x, RADIUS)  # Of a pixel's lens.
+    truth = hides + (1 - hides) * wall
+    row = lambda values: np.broadcast_to(values, (SIZE, SIZE))
+    image, depth = row(np.where(x < 0, 1.0, wall))[..., None], row(np.where(x < 0, 1.0, 2.0))
+    second = row(wall)[..., None], row(np.where(x < 0, 2.0, np.inf))
+    behind = {"layered, one layer": None, "layered, true second": second}
+    if method in behind:
+        options = {"max_coc": MAX_COC, "behind": behind[method]}
+        seen = jax.jit(lambda *data: dof.layered(*data, **options))(image, depth, FAR_FOCUS)
+    else:
+        seen = blurred(method)(image, depth, FAR_FOCUS)
+    error = np.asarray(seen)[MIDDLE, :, 0] - truth
+    return Found({"rms in the band": _rms(error[np.abs(x) < RADIUS + 1])}, seen)
+
+
+@case(
+    "dof",
+    {"rms on the outline": 0.04},
+    (*METHODS, "layered, split"),
+    {"layered, split": "biased: colours are parted by an estimate"},
+)
+def mixed_pixels(method):
+    """A dark bar in focus, antialiased, whose outline's pixels are half of a striped wall,
+    which is blurred: rms error of those pixels. Each shows its own stripe: dots along the
+    outline."""
+    x, y = np.arange(SIZE), np.arange(SIZE) + 0.5 - MIDDLE
+    share = np.clip(np.minimum(x + 1 - 18.5, 22.5 - x), 0, 1)
+    stripes = np.where(np.arange(-40, SIZE + 40) % 4 < 2, 0.65, 0.95)
+    weight = np.diff(1 - covered(np.arange(-40.5, 41), RADIUS))
+    wall = np.convolve(stripes, weight, mode="same")[40:-40]
+    mixed = lambda wall: 0.05 * share + wall[:, None] * (1 - share)
+    image, truth = mixed(stripes[40:-40])[..., None], mixed(wall)
+    depth = np.broadcast_to(np.where(share > 0, 1.0, 2.0), (SIZE, SIZE))
+    seen = np.asarray(blurred(method)(image, depth, NEAR_FOCUS))
+    error = (seen[..., 0] - truth)[np.abs(y) < 8][:, share == 0.5]
+    return Found({"rms on the outline": _rms(error)}, seen)
+
+
+@case(
+    "dof",
+    {"elsewhere": 0.05, "energy": 1e-5},
+    (*METHODS, "scatter, hexagon", "layered, hexagon"),
+)
+def light_through_six_blades(method):
+    """A light of 50 times white, whose disc is a hexagon: the share of the light that lies
+    elsewhere, beside exact areas, and the error of its energy."""
+    lens, image = ThinLens(1.0, 1.0, 2 * RADIUS), np.zeros((SIZE, SIZE, 1))
+    image[MIDDLE, MIDDLE] = 50
+    # Points of each pixel that lie within all six sides.
+    fine = (np.arange(SIZE * 32) + 0.5) / 32 - MIDDLE - 0.5
+    sides = 0.3 + np.pi / 6 + np.arange(6) * np.pi / 3
+    apothem = RADIUS * np.cos(np.pi / 6)
+    within = np.ones((fine.size, fine.size), bool)
+    for side in sides:
+        within &= fine * np.cos(side) + fine[:, None] * np.sin(side) < apothem
+    truth = within.reshape(SIZE, 32, SIZE, 32).mean(axis=(1, 3))
+    name, _, shape = method.partition(", ")
+    if shape:
+        call = getattr(dof, name)
+        iris = dof.Iris(6, rotation=0.3)
+        blur = jax.jit(lambda *data: call(*data, iris=iris, max_coc=MAX_COC))
+        seen = blur(image, FLAT, lens)
+    else:
+        seen = blurred(method)(image, FLAT, lens)
+    seen = np.asarray(seen)[..., 0] / 50
+    off = np.abs(seen - truth / truth.sum()).sum() / 2
+    figures = {"elsewhere": float(off), "energy": float(abs(seen.sum() - 1))}
+    return Found(figures, seen[8:-8, 8:-8] / seen.max())
+
+
+@case(
+    "dof",
+    {"rms in the border": 0.02},
+    (*METHODS, "layered, reflect", "layered, margin", "scatter, margin"),
+)
+def beyond_the_frame(method):
+    """A blurred plane with waves that go on beyond the frame: rms error in the border of one
+    radius, by the closed form of a disc's blur. One image does not hold what lies there."""
+    beyond, wave = 8, 0.35
+    x = np.arange(-beyond, SIZE + beyond) + 0.5
+    size = SIZE + 2 * beyond
+    waves = np.broadcast_to(0.5 + 0.4 * np.sin(wave * x), (size, size))[..., None]
+    shrunk = 2 * scipy.special.j1(wave * RADIUS) / (wave * RADIUS)
+    truth = 0.5 + 0.4 * shrunk * np.sin(wave * x[beyond:-beyond])
+    lens, name = ThinLens(1.0, 1.0, 2 * RADIUS), method.partition(", ")[0]
+    if method.endswith("margin"):
+        call, depth = getattr(dof, name), np.full((size, size), FLAT[0, 0])
+        options = {"max_coc": MAX_COC, "margin": beyond}
+        seen = jax.jit(lambda *data: call(*data, **options))(waves, depth, lens)
+    else:
+        inner = waves[beyond:-beyond, beyond:-beyond]
+        seen = blurred(method)(inner, FLAT, lens)
+    error = np.asarray(seen)[MIDDLE, :, 0] - truth
+    return Found({"rms in the border": _rms(np.r_[error[:6], error[-6:]])}, seen)

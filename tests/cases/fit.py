@@ -222,3 +222,36 @@ def a_lens_that_cannot_be_seen(loss):
         {"successes": float(np.mean(successes))},
         np.clip(np.concatenate([image, reference], axis=1), 0, 1),
     )
+
+
+@case(
+    "fit",
+    {"off": 0.01, "untold": None, "told without texture": 0.01},
+    ("focal_stack",),
+    "none: a search stops at every step to report",
+)
+def a_focal_stack_of_half_an_even_wall(_):
+    """Four images of a wall, noise of half a percent, whose right half has no texture: the
+    median relative error of the depth where it is determined and there is texture, the share
+    of that half where it is not, and the share of the even half that is called determined."""
+    rng, size = np.random.default_rng(4), (40, 64)
+    texture = np.kron(rng.random((20, 32, 3)), np.ones((2, 2, 1)))
+    image = np.where(np.arange(64)[:, None] < 32, texture, 0.5)
+    depth, lenses = np.full(size, 2.0), [ThinLens(0.2, z, 80.0) for z in (1.5, 1.9, 2.5, 3.6)]
+    stack = [
+        np.asarray(dof.scatter(image, depth, lens)) + 0.005 * rng.normal(size=image.shape)
+        for lens in lenses
+    ]
+    options = {"min_depth": 1.2, "max_depth": 5.0, "max_steps": 4, "throw": False}
+    found = fit.focal_stack(stack, lenses, **options)
+    told = np.asarray(found.determined)
+    # The largest circle of confusion is 3.6 pixels wide; a window about a pixel is as wide.
+    textured, even = told[:, :24], told[:, 40:]
+    off = np.abs(np.asarray(found.depth) / depth - 1)[:, :24][textured]
+    figures = {
+        "off": float(np.median(off)) if off.size else 1.0,
+        "untold": float(np.mean(~textured)),
+        "told without texture": float(np.mean(even)),
+    }
+    shown = np.where(told[..., None], np.asarray(found.depth)[..., None] / 4, 0)
+    return Found(figures, np.concatenate([stack[1], shown * np.ones(3)], axis=0))

@@ -15,6 +15,7 @@ import pytest
 from jaxfx import ThinLens, dof
 from jaxfx.dof.accumulate import lens_samples
 from tests.dof.test_layered import FAR, FOCUS, LENS, NEAR, SIZE, texture
+from tests.helpers.quick import check_slopes
 
 
 # Depths at which LENS has a defocus of -4 and -6 pixels.
@@ -27,10 +28,11 @@ def passes(planes, samples=512):
 
     A plane is read between its pixels, along a row: each is the same in all rows.
     """
-    x = np.arange(SIZE[1], dtype=float)
-    total = np.zeros((SIZE[1], 3))
+    size = len(planes[0][1])
+    x = np.arange(size, dtype=float)
+    total = np.zeros((size, 3))
     for u in 2 * lens_samples(samples)[0][:, 0]:
-        left = np.ones((SIZE[1], 1))
+        left = np.ones((size, 1))
         for image, alpha, defocus in planes:
             at = x - u * defocus / 2
             read = lambda row, at=at: np.interp(at, x, row)
@@ -195,6 +197,106 @@ def test_a_margin_is_left_out_of_the_output(margin):
     assert np.abs(blur(margin=margin) - inside).max() < 1e-9
 
 
+@pytest.mark.full
+def test_rgba_and_disparity_before_a_background_and_its_disparity():
+    """As matting tools have it: straight colours and alpha, blur strength, focus disparity."""
+    front, wall = waves(9), waves(10)
+    matte = np.clip((40 - COLUMN) / 16, 0, 1)
+    rgba = wide(np.concatenate([front, matte[:, None]], axis=1))
+    disparity, behind = np.full(SIZE, 0.9), np.full(SIZE, 0.4)
+    lens = ThinLens.from_disparity(strength=20.0, focus_disparity=0.9)
+    exact = passes([(front, matte, 0), (wall, np.ones(SIZE[1]), 20 * (0.9 - 0.4))])
+    found = dof.layered(
+        rgba[..., :3],
+        1 / disparity,
+        lens,
+        max_coc=12.0,
+        alpha=rgba[..., 3],
+        behind=(wide(wall), 1 / behind),
+    )
+    # As of any soft matte in focus before a wall out of focus.
+    assert np.abs(found[12] - exact)[8:-8].max() < 0.02
+    # All four as colours: each is what it is by itself, and nothing shows through.
+    four = dof.layered(rgba, 1 / disparity, lens, max_coc=12.0)
+    np.testing.assert_allclose(four, rgba, atol=1e-12)
+
+
+@pytest.mark.parametrize(("pad", "mode"), [("repeat", "edge"), ("reflect", "symmetric")])
+def test_what_lies_beyond_the_frame_is_what_passes_show(pad, mode):
+    """Two planes side by side, both out of focus: the first and the last columns."""
+    image, matte = waves(6), 1.0 * (COLUMN < 30)
+    wider = lambda row: np.pad(row, [(8, 8)] + [(0, 0)] * (row.ndim - 1), mode=mode)
+    near, wall = wider(image), wider(waves(7))
+    # The passes read beyond the row's ends too: pads are wider than the largest radius.
+    planes = [(near, wider(matte), -12), (wall, np.ones(len(wall)), 4)]
+    exact = passes(planes)[8:-8]
+    depth = wide(np.where(COLUMN < 30, NEAR, 3.0))
+    front = wide(np.where(COLUMN[:, None] < 30, image, waves(7)))
+    behind = wide(waves(7)), wide(np.where(COLUMN < 30, 3.0, np.inf))
+    found = dof.layered(front, depth, LENS, max_coc=12.0, behind=behind, pad=pad)[12]
+    ends = np.r_[:8, -8:0]
+    assert np.abs(found - exact)[ends].max() < 0.015
+    other = {"repeat": "reflect", "reflect": "repeat"}[pad]
+    wrong = dof.layered(front, depth, LENS, max_coc=12.0, behind=behind, pad=other)[12]
+    assert np.abs(wrong - exact)[ends].max() > 0.04
+
+
+@pytest.mark.parametrize("margin", [0, 2])
+@pytest.mark.full
+def test_a_mirror_image_is_that_of_arrays_that_are_mirrored(margin):
+    """All layers, alpha, and a lens with circles of its own; an image smaller than a sprite."""
+    image, depth, behind, alpha = small(3)
+
+    class Other:
+        focus_distance = LENS.focus_distance
+        defocus = staticmethod(LENS.defocus)
+        circle_of_confusion = staticmethod(LENS.circle_of_confusion)
+
+    mirrored = lambda x: np.pad(x, [(9, 9)] * 2 + [(0, 0)] * (x.ndim - 2), mode="symmetric")
+    options = {"max_coc": 14.0, "lens": Other()}
+    found = dof.layered(
+        image, depth, alpha=alpha, behind=behind, margin=margin, pad="reflect", **options
+    )
+    expected = dof.layered(
+        mirrored(image),
+        mirrored(depth),
+        alpha=mirrored(alpha),
+        behind=[tuple(map(mirrored, layer)) for layer in behind],
+        margin=9 + margin,
+        **options,
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.full
+def test_slopes_of_a_mirror_image_are_the_difference_quotient():
+    image, depth, behind, alpha = small(4)
+    weight = np.random.default_rng(5).random(image.shape)
+
+    def loss(image, depth, aperture):
+        lens = ThinLens(aperture, LENS.focus_distance, LENS.focal_pixels)
+        options = {"max_coc": 8.0, "behind": behind, "alpha": alpha, "pad": "reflect"}
+        return jnp.sum(weight * dof.layered(image, depth, lens, **options))
+
+    operands = jnp.asarray(image), jnp.asarray(depth), LENS.aperture
+    check_slopes(loss, operands, atol=1e-5, rtol=1e-5, eps=1e-6)
+
+
+def test_a_margin_of_scatter_is_what_passes_show():
+    """A plane out of focus that goes on beyond the frame."""
+    row, beyond = waves(8), 10
+    exact = passes([(row, np.ones(SIZE[1]), 12)])[beyond:-beyond]
+    high = lambda x: np.broadcast_to(x, (SIZE[0] + 20, *x.shape))
+    lens = ThinLens(1.0, 2.0, 24.0)
+    depth = np.full((SIZE[0] + 20, SIZE[1]), np.inf)
+    found = dof.scatter(high(row), depth, lens, max_coc=12.0, margin=beyond)
+    assert found.shape == (SIZE[0], SIZE[1] - 2 * beyond, 3)
+    assert np.abs(found[12] - exact).max() < 0.002
+    inside = lambda x: x[:, beyond:-beyond]
+    alone = dof.scatter(inside(high(row)), inside(depth), lens, max_coc=12.0)[22]
+    assert np.abs(alone - exact).max() > 0.05
+
+
 def test_faults_are_named():
     layered = inspect.unwrap(dof.layered)
     image, depth = texture(), np.full(SIZE, 2.0)
@@ -209,3 +311,7 @@ def test_faults_are_named():
     for margin in (-1, 12, 0.5):
         with pytest.raises(ValueError, match=r"`layered\(margin=...\)` must be an integer"):
             layered(image, depth, LENS, margin=margin)
+        with pytest.raises(ValueError, match=r"`scatter\(margin=...\)` must be an integer"):
+            inspect.unwrap(dof.scatter)(image, depth, LENS, margin=margin)
+    with pytest.raises(ValueError, match=r"`layered\(pad=...\)` must be "):
+        layered(image, depth, LENS, pad="black")

@@ -264,3 +264,21 @@ def test_a_batch_of_rims_is_each_by_itself():
     numbers = jnp.array([[0.2, 0.5], [0.9, -0.4]])
     each = jnp.stack([jax.jit(draw)(x) for x in numbers])
     np.testing.assert_allclose(jax.jit(jax.vmap(draw))(numbers), each, atol=1e-12)
+
+
+@first("method", [dof.scatter, dof.layered])
+def test_the_corner_is_that_of_the_frame_within_a_margin(method):
+    """The last pixels, repeated: inside of their reach all is as without them."""
+    image = jnp.asarray(np.random.default_rng(0).random((20, 24, 1)))
+    lens, iris = ThinLens(1.0, 2.0, 12.0), Iris(vignetting=0.9)
+    blur = lambda image, **more: method(
+        image, jnp.full(image.shape[:2], jnp.inf), lens, max_coc=6.0, iris=iris, **more
+    )
+    wider = jnp.pad(image, [(5, 5), (5, 5), (0, 0)], mode="edge")
+    inside = lambda x: x[3:-3, 3:-3]
+    expected = inside(blur(image))
+    np.testing.assert_allclose(inside(blur(wider, margin=5)), expected, atol=1e-12)
+    assert jnp.abs(inside(blur(wider)[5:-5, 5:-5]) - expected).max() > 0.01
+    # A margin that is far wider than the frame.
+    small = blur(wider, margin=14)
+    assert small.shape == (2, 6, 1) and jnp.isfinite(small).all()
