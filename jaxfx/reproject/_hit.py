@@ -197,8 +197,8 @@ def patch_point(
     """
     hold = jax.lax.stop_gradient
     # By coordinate: what a loop reads is kept as it is.
-    rays = [[x[:, k] for k in range(3)] for x in (origin, direction)]
-    held_field, (o, d) = hold(height_field), hold(rays)
+    origins, directions = ([x[:, k] for k in range(3)] for x in (origin, direction))
+    held_field, o, d = hold(height_field), hold(origins), hold(directions)
     anchor = jnp.where(hit.mask, held_field[hit.y, hit.x], 0)
 
     def patch_miss(height_field, origin, direction, time):
@@ -231,7 +231,7 @@ def patch_point(
     is_on_patch = is_steep & (last_move * speed < _CONVERGED_TEXELS) & hit.mask
     time = jnp.where(is_on_patch, time, hit.time)
     texel_miss, texel_slope = _texel_miss(height_field, origin, direction, hit)
-    miss = patch_miss(height_field, *rays, time)
+    miss = patch_miss(height_field, origins, directions, time)
     miss = jnp.where(is_on_patch, miss, texel_miss)
     slope = jnp.where(is_on_patch, slope, texel_slope)
     is_differentiable, grazing = hit.mask & (slope != 0), hit.mask & ~is_on_patch

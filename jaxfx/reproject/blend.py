@@ -144,12 +144,12 @@ def _blended(
     def of_all_rays(pixels: Array) -> tuple[Array, Array]:
         of_source = functools.partial(traced, pixels)
         patches, *found = _over_cameras(of_source, depths, cameras)
-        weights, total = weights_of(*found), 0
+        weights, weighted = weights_of(*found), []
         for k, (image, weight) in enumerate(zip(images, weights, strict=True)):
             patch = jax.tree.map(lambda x, k=k: x[k], patches)
             colors = patch.read_colors(image).astype(weights.dtype)
-            total = total + jnp.where(weight > 0, colors, 0) * weight
-        return mean(total, weights)
+            weighted.append(jnp.where(weight > 0, colors, 0) * weight)
+        return mean(functools.reduce(jnp.add, weighted), weights)
 
     def in_parts(pixels: Array) -> tuple[Array, Array]:
         parts = -(-len(images) * len(pixels) // _RAYS_AT_ONCE)

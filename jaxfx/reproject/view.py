@@ -70,18 +70,19 @@ def trace_pixels(
     # In units of 1 / unit; missing pixels are at +inf, which no ray reaches.
     inverse_depth = jnp.where(is_known, -1 / jnp.where(is_known, depth / unit, 1), jnp.inf)
     rays = view_rays(camera, target, pixels, height=height, width=width, unit=unit)
-    ray = rays.origin, rays.direction
-    hit = first_crossing(inverse_depth, *ray, search, max_steps, origin_at_end=True)
+    hit = first_crossing(
+        inverse_depth, rays.origin, rays.direction, search, max_steps, origin_at_end=True
+    )
 
-    def computed_again(pixels, time, *_):
+    def computed_again(rays, pixels, time):
         pixels, _ = jax.lax.optimization_barrier((pixels, time))
-        again = view_rays(camera, target, pixels, height=height, width=width, unit=unit)
-        return again.origin, again.direction
+        return view_rays(camera, target, pixels, height=height, width=width, unit=unit)
 
     # An accelerator has them twice rather than keep both forms while the rays are stepped.
-    ray = by_platform(
-        pixels, hit.time, *ray, cpu=lambda _, __, *ray: ray, accelerator=computed_again
+    rays = by_platform(
+        rays, pixels, hit.time, cpu=lambda rays, *_: rays, accelerator=computed_again
     )
+    ray = rays.origin, rays.direction
     # A ray that ends at infinity may meet a surface there, but nothing beyond it.
     is_in_front = hold(ray[0][:, 2] + hit.time * ray[1][:, 2]) <= 0
     hit = hit._replace(mask=hit.mask & rays.inside & is_in_front)
