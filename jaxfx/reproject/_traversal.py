@@ -21,8 +21,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxfx._loops import while_loop
 from jaxfx._platform import by_platform
@@ -116,7 +115,7 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     offset = jnp.asarray(pyramid.offsets, jnp.int32)[read_level]
     cell_x, cell_y = x >> read_level, y >> read_level
     index = offset + cell_y * columns + cell_x
-    nearest = _read(pyramid.values, index)
+    nearest = pyramid.values.at[index].get(mode="promise_in_bounds")
 
     border_x, border_y = (cell_x + 1 - left) << read_level, (cell_y + 1 - up) << read_level
     leave_x = crossing_moment(border_x, r.ox, r.ix, left)
@@ -154,20 +153,6 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     is_done = is_hit | is_miss
     next_x, next_y = jnp.where(is_done, x, next_x), jnp.where(is_done, y, next_y)
     return jnp.where(level >= MISS, state, pack(next_x, next_y, next_level, left, up))
-
-
-@custom_vmap
-def _read(values: Float[Array, " cell"], index: Int[Array, "*ray"]) -> Float[Array, "*ray"]:
-    """Cells by index; of a batch of pyramids, as one array: a gather of one number is cheap."""
-    return values.at[index].get(mode="promise_in_bounds")
-
-
-@_read.def_vmap
-def _(size, is_batched, values, index):
-    if is_batched[0]:
-        first = jnp.arange(size, dtype=index.dtype) * values.shape[-1]
-        index, values = index + first[:, None], values.reshape(-1)
-    return _read(values, index), True
 
 
 def _clip_to_cell(

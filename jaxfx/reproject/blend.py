@@ -35,7 +35,7 @@ from jaxfx.reproject.view import trace_with_angle
 _STRIDE = 8
 # Rays that an accelerator traces at once, of all cameras together. Each takes some 100 bytes
 # while it is stepped; with fewer rays at a time there are more launches.
-_RAYS_AT_ONCE = 3 * 2**18
+_RAYS_AT_ONCE = 2**20
 # Pixels of one part are a multiple of this: of an odd number XLA fuses less.
 _WHOLE_PIXELS = 1024
 
