@@ -35,17 +35,8 @@ MODULES = (
     *("depth", "scene", "exr", "io", "metrics", "tradeoff"),
 )
 GUIDES = (
-    *(
-        "depth_of_field",
-        "lens",
-        "focal_stack",
-        "blur",
-        "reproject",
-        "shadow",
-        "relight",
-        "fitting",
-    ),
-    "charts",
+    *("depth_of_field", "lens", "focal_stack", "blur", "reproject", "shadow", "relight"),
+    *("fitting", "charts"),
 )
 
 

@@ -10,14 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import (
-    Number,
-    WholeNumber,
-    check,
-    is_concrete,
-    option,
-    parameter,
-)
+from jaxfx._checks import Number, WholeNumber, check, is_concrete, option, parameter
 from jaxfx._meshes import on_any_mesh
 from jaxfx._platform import either
 from jaxfx.dof.arguments import (

@@ -195,7 +195,7 @@ class _Objective(eqx.Module):
 
 
 def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Linear:
-    """A residual and its Jacobian, by the program of a search by our own solver."""
+    """A residual, its Jacobian and its mean square, by the program that `descend` runs."""
     return linearised(_Objective(residual, scalar=False), unknowns, None)
 
 
@@ -204,67 +204,76 @@ def _default_solver() -> LevenbergMarquardt:
     return LevenbergMarquardt(rtol=1e-4, atol=1e-5)
 
 
-# The state of another solver holds functions, which `jit` compares by identity: passed to
-# `jit` as it is, it would compile every search again. Only its arrays leave a compiled
-# function, and go back into a state that is built inside the next one, so that all searches
-# share one program. Our own solver's state is all arrays, and its steps are programs already.
 _REST = {"args": None, "options": {}, "tags": frozenset()}
 
 
 def _is_ours(solver: Any) -> bool:
+    """Whether a solver's state is all arrays, and its steps are compiled by themselves."""
     return isinstance(solver, LevenbergMarquardt)
 
 
-def _new_state(solver: Any, fn: _Objective, y: Any) -> Any:
+def _initial_state(solver: Any, fn: _Objective, y: Any) -> Any:
     out, loss = eqx.filter_eval_shape(fn, y, None)
     return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
 
 
-def _kept(solver: Any, state: Any) -> Any:
-    """What is kept of a state from one step to the next."""
-    return state if _is_ours(solver) else jax.tree.leaves(eqx.filter(state, eqx.is_array))
-
-
-def _state(solver: Any, fn: _Objective, y: Any, kept: Any) -> Any:
-    """The state of which `kept` was kept."""
-    if _is_ours(solver):
-        return kept
-    old, static = eqx.partition(_new_state(solver, fn, y), eqx.is_array)
-    return eqx.combine(jax.tree.unflatten(jax.tree.structure(old), kept), static)
-
-
-@eqx.filter_jit
 def _begin(solver, fn, y):
-    return _kept(solver, _new_state(solver, fn, y))
+    """The state before the first step; of other solvers' states, the arrays."""
+    state = _initial_state if _is_ours(solver) else _arrays_of_initial_state
+    return state(solver, fn, y)
 
 
-def _step(solver, fn, y, kept):
+def _step(solver, fn, y, state):
     """Unknowns, state, the loss before the step, whether the search has ended, its verdict."""
-    return (_take_step if _is_ours(solver) else _compiled_step)(solver, fn, y, kept)
+    return (_stepped if _is_ours(solver) else _step_of_arrays)(solver, fn, y, state)
 
 
-def _take_step(solver, fn, y, kept):
-    y, state, loss = solver.step(fn, y, state=_state(solver, fn, y, kept), **_REST)
-    return y, _kept(solver, state), loss, *solver.terminate(fn, y, state=state, **_REST)
-
-
-_compiled_step = eqx.filter_jit(_take_step)
-
-
-def _finish(solver, fn, y, kept, loss, result):
+def _finish(solver, fn, y, state, loss, result):
     """The unknowns after the last step, and their loss."""
     if _is_ours(solver):
-        return solver.postprocess(fn, y, loss, state=kept, result=result, **_REST)[:2]
-    y = _postprocessed(solver, fn, y, kept, loss, result)
+        return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[:2]
+    y = _end_of_arrays(solver, fn, y, state, loss, result)
     return y, _loss(fn, y)
 
 
-@eqx.filter_jit
-def _postprocessed(solver, fn, y, kept, loss, result):
-    state = _state(solver, fn, y, kept)
-    return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[0]
+def _stepped(solver, fn, y, state):
+    y, state, loss = solver.step(fn, y, state=state, **_REST)
+    return y, state, loss, *solver.terminate(fn, y, state=state, **_REST)
 
 
 @eqx.filter_jit
 def _loss(fn, y):
     return fn(y, None)[1]
+
+
+# The state of another solver holds functions, which `jit` compares by identity: passed to
+# `jit` as it is, it would compile every search again. Only its arrays leave a compiled
+# function, and go back into a state that is built inside the next one, so that all searches
+# share one program.
+
+
+def _arrays_of(state: Any) -> list[Array]:
+    return jax.tree.leaves(eqx.filter(state, eqx.is_array))
+
+
+def _state_with(solver: Any, fn: _Objective, y: Any, arrays: list[Array]) -> Any:
+    """A solver's state that has these arrays."""
+    initial, rest = eqx.partition(_initial_state(solver, fn, y), eqx.is_array)
+    return eqx.combine(jax.tree.unflatten(jax.tree.structure(initial), arrays), rest)
+
+
+@eqx.filter_jit
+def _arrays_of_initial_state(solver, fn, y):
+    return _arrays_of(_initial_state(solver, fn, y))
+
+
+@eqx.filter_jit
+def _step_of_arrays(solver, fn, y, arrays):
+    y, state, *rest = _stepped(solver, fn, y, _state_with(solver, fn, y, arrays))
+    return y, _arrays_of(state), *rest
+
+
+@eqx.filter_jit
+def _end_of_arrays(solver, fn, y, arrays, loss, result):
+    state = _state_with(solver, fn, y, arrays)
+    return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[0]

@@ -1,10 +1,14 @@
 """Our Levenberg-Marquardt against optimistix', step by step."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array
 
-from jaxfx.fit._descent import _begin, _Objective, _step
+from jaxfx._progress import Bar
+from jaxfx.fit._descent import _begin, _Objective, _step, descend
 from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt
 from tests.helpers.forms import first
 
@@ -57,3 +61,39 @@ def test_every_step_is_that_of_optimistix(function, steps):
         np.testing.assert_allclose(numbers, others, rtol=1e-9, atol=1e-12)
         assert done == has_ended
         assert (result == optx.RESULTS.successful) == (verdict == optx.RESULTS.successful)
+
+
+class Line(eqx.Module):
+    """A residual whose least mean square is in closed form: a line through points."""
+
+    x: Array
+    y: Array
+
+    def __call__(self, unknowns):
+        return unknowns["a"] + unknowns["b"] * self.x - self.y
+
+
+@first(
+    ("solver", "steps"),
+    [
+        (None, 40),
+        (None, 3),
+        (optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8), 40),
+        (optx.BFGS(rtol=1e-8, atol=1e-8), 40),
+    ],
+)
+def test_the_last_loss_is_the_mean_square_at_the_unknowns(solver, steps):
+    x = np.linspace(-1, 2, 9)
+    y = 0.5 + 2 * x + np.sin(9 * x)
+    start = {"a": jnp.asarray(4.0), "b": jnp.asarray(-3.0)}
+
+    def ended(x, y):
+        with Bar(False, "fit") as bar:
+            return descend(Line(x, y), start, solver=solver, max_steps=steps, bar=bar)
+
+    for end in (ended(jnp.asarray(x), jnp.asarray(y)), jax.jit(ended)(x, y)):
+        a, b = (float(end.unknowns[name]) for name in "ab")
+        np.testing.assert_allclose(end.losses[-1], np.mean((a + b * x - y) ** 2), rtol=1e-12)
+        if steps == 40:
+            slope, intercept = np.polyfit(x, y, 1)
+            np.testing.assert_allclose((a, b), (intercept, slope), rtol=1e-4)

@@ -177,7 +177,7 @@ def _arriving(
         row = (reach - index * rows - jnp.arange(rows)).astype(dtype)
         span = jax.vmap(_half_width)(near(sheet.radius), row)
         moved = near(sheet.tilt[0]) * span * span / 3
-        # Kept in memory.
+        # Kept in memory: a reduction would compute it again for every tap.
         ends = jax.lax.optimization_barrier([moved - span, moved + span])
         ends = [windows(x, -1, columns) for x in ends]
         rows_and_tilt = row[:, None, None, None], there(sheet.tilt[1])
@@ -282,7 +282,7 @@ def _read_back(
     edge = jnp.asarray(across + 0.5 - np.arange(taps)[None, None, :, None], dtype)
     at_pixel = lambda x: x[None, :, None]
     of_sprite = lambda value, planes: ft.reduce(jnp.add, map(jnp.multiply, value, planes))
-    # Kept in memory.
+    # Kept in memory: a reduction would compute it again for every tap.
     operands = sheet, share_of(_away(sheet, first)), [jnp.pad(bar, pad) for bar in bars]
     sheet, shares, seen = jax.lax.optimization_barrier(operands)
 
@@ -299,7 +299,7 @@ def _read_back(
             )
             return windows(windows(near, -2, rows), -1, taps)
 
-        # Kept in memory.
+        # Kept in memory: a reduction would compute it again for every tap.
         kept = jax.lax.optimization_barrier([moved - span, moved + span, slope])
         kept = [x[:, :, None] for x in kept]
         bars = [[there(x) for x in bar] for bar in seen]

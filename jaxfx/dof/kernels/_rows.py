@@ -75,7 +75,7 @@ def _sums(
             ft.partial(_half_widths, slopes=slopes), (None if by_source else 0, 0)
         )
         spans = half_widths(sprite if by_source else at_rows(sprite), row)
-        # Kept in memory.
+        # Kept in memory: a reduction would compute it again for every tap.
         spans = jax.lax.optimization_barrier(spans)
         wide = [x[:, :, None] if by_source else windows(x, 2, taps) for x in spans]
         near = jax.tree.map(lambda x: windows(at_rows(x), 2, taps), there)
