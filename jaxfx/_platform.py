@@ -25,6 +25,14 @@ def by_platform(
     return jax.lax.platform_dependent(*operands, cpu=cpu, default=accelerator)
 
 
+def kept(arrays: Any) -> Any:
+    """The arrays as they are, which an accelerator computes once and keeps in memory.
+
+    XLA else keeps all that they are computed from, and each reader computes them again.
+    """
+    return by_platform(arrays, cpu=lambda x: x, accelerator=jax.lax.optimization_barrier)
+
+
 def one_by_one_on_cpu(
     function: Callable[..., Any], accelerator: Callable[..., Any] | None = None
 ) -> Callable[..., Any]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Int8, Int16
 
 
 # The face through which a ray meets a texel's column: its top, a side at a border in x or in y,
@@ -25,20 +25,25 @@ class TexelHit(NamedTuple):
     """The first texel whose column each ray meets, as a search returns it. Not differentiated.
 
     - `time`: the parameter t of origin + t direction; 0 for a miss.
-    - `x`, `y`: column and row of the texel.
-    - `face`: one of `TOP`, `X_SIDE`, `Y_SIDE` and `START`.
+    - `x`, `y`: column and row of the texel, in 16 bits: a side has at most 2**13 texels.
+    - `face`: one of `TOP`, `X_SIDE`, `Y_SIDE` and `START`, in 8 bits.
     - `mask`: whether there is a hit.
     - `steps`: cells of the pyramid, or points of the ray, that were compared.
     - `exhausted`: whether a bound on the steps ended the search; it counts as a miss.
     """
 
     time: Float[Array, " ray"]
-    x: Int[Array, " ray"]
-    y: Int[Array, " ray"]
-    face: Int[Array, " ray"]
+    x: Int16[Array, " ray"]
+    y: Int16[Array, " ray"]
+    face: Int8[Array, " ray"]
     mask: Bool[Array, " ray"]
     steps: Int[Array, " ray"]
     exhausted: Bool[Array, " ray"]
+
+    def read(self, values: Float[Array, "height width"]) -> Float[Array, " ray"]:
+        """The value of a map in each texel; 0 for a miss."""
+        place = self.y.astype(jnp.int32), self.x.astype(jnp.int32)
+        return jnp.where(self.mask, values.at[place].get(mode="promise_in_bounds"), 0)
 
 
 class GridRays(eqx.Module):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._loops import fori_loop, scan
 from jaxfx._numerics import safe_divide
-from jaxfx._platform import by_platform
+from jaxfx._platform import by_platform, kept
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, not_before_start
 
 
@@ -36,22 +36,30 @@ _CONVERGED_TEXELS = 1e-2
 _MIN_SLOPE = 1e-3
 
 
+# The texels of a stencil, down and to the right of its first.
+_CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
+
+
 class Patch(NamedTuple):
-    """An edge-aware bilinear stencil: four texels around each point, and their weights.
+    """An edge-aware bilinear stencil: 2 x 2 texels around each point, and their weights.
 
     A weight is 0 where the texel lies on another surface. A weight that is 0 only because of
     the position still has a derivative; its texel is skipped only where it is not finite.
+
+    - `row`, `column`: of the texel at the upper left, from -1 on. For a texel outside of the
+      map the nearest one inside is read.
+    - `weights`: of the texels in the order of `_CORNERS`.
     """
 
-    rows: Int[Array, "4 ray"]
-    columns: Int[Array, "4 ray"]
+    row: Int[Array, " ray"]
+    column: Int[Array, " ray"]
     weights: Float[Array, "4 ray"]
 
     def read(self, values: Float[Array, "height width"]) -> Float[Array, " ray"]:
         """The weighted mean of a map; 0 where all weights are 0."""
         total = jnp.zeros_like(self.weights[0])
-        for row, column, weight in zip(self.rows, self.columns, self.weights, strict=True):
-            texel = values.at[row, column].get(mode="promise_in_bounds")
+        for corner, weight in zip(_CORNERS, self.weights, strict=True):
+            texel = _texel(values, self.row, self.column, corner)
             total = total + weight * _unless_unusable(texel, weight)
         return safe_divide(total, jnp.sum(self.weights, axis=0))
 
@@ -59,30 +67,38 @@ class Patch(NamedTuple):
         """The weighted mean of each channel: ray channel.
 
         On a CPU `scan` stores the stencil. Without it, XLA would fuse the search into each
-        channel. On an accelerator the weights are stored, and all is read at once.
+        channel. On an accelerator all is read at once.
         """
 
-        def add(sums: tuple[Array, Array], texel: tuple[Array, Array, Array]) -> Any:
-            (total, weight_sum), (row, column, weight) = sums, texel
-            color = image.at[row, column].get(mode="promise_in_bounds")
-            weight_sum = weight_sum + weight
+        def add(total: Array, texel: tuple[Any, Array]) -> Any:
+            corner, weight = texel
+            color = _texel(image, self.row, self.column, corner)
             weight = jnp.broadcast_to(weight[:, None], color.shape)
-            return (total + weight * _unless_unusable(color, weight), weight_sum), None
+            return total + weight * _unless_unusable(color, weight), None
 
-        def at_once(sums: tuple[Array, Array], *texels: Array) -> tuple[Array, Array]:
-            rows, columns, weights = texels
-            weights = jax.lax.optimization_barrier(weights)
-            for texel in zip(rows, columns, weights, strict=True):
-                sums, _ = add(sums, texel)
-            return sums
+        def in_turn(total: Array, weights: Array) -> Array:
+            return scan(add, total, (jnp.asarray(_CORNERS, jnp.int32), weights))[0]
+
+        def at_once(total: Array, weights: Array) -> Array:
+            for texel in zip(_CORNERS, weights, strict=True):
+                total, _ = add(total, texel)
+            return total
 
         weights = self.weights.astype(image.dtype)
+        weight_sum = jnp.sum(weights, axis=0, keepdims=True)
+        weights = safe_divide(weights, jnp.broadcast_to(weight_sum, weights.shape))
         total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
-        sums = total, jnp.zeros_like(weights[0])
-        in_turn = lambda sums, *texels: scan(add, sums, texels)[0]
-        operands = sums, self.rows, self.columns, weights
-        total, weight_sum = by_platform(*operands, cpu=in_turn, accelerator=at_once)
-        return safe_divide(total, jnp.broadcast_to(weight_sum[:, None], total.shape))
+        return by_platform(total, weights, cpu=in_turn, accelerator=at_once)
+
+
+def _texel(
+    values: Float[Array, "height width *channel"], row: Array, column: Array, corner: Any
+):
+    """The texel of each stencil in one of its corners."""
+    down, right = corner
+    height, width = values.shape[:2]
+    place = jnp.clip(row + down, 0, height - 1), jnp.clip(column + right, 0, width - 1)
+    return values.at[place].get(mode="promise_in_bounds")
 
 
 def _unless_unusable(texel: Float[Array, "*shape"], weight: Float[Array, "*shape"]) -> Array:
@@ -106,21 +122,18 @@ def edge_aware_patch(
     height, width = height_field.shape
     corner_x, corner_y = (jax.lax.stop_gradient(jnp.floor(v - 0.5)) for v in (x, y))
     fraction_x, fraction_y = x - 0.5 - corner_x, y - 0.5 - corner_y
-    rows, columns, weights = [], [], []
-    for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        column = jnp.clip(corner_x + i, 0, width - 1).astype(jnp.int32)
-        row = jnp.clip(corner_y + j, 0, height - 1).astype(jnp.int32)
-        value = height_field.at[row, column].get(mode="promise_in_bounds")
-        value = jax.lax.stop_gradient(value)
+    column = jnp.clip(corner_x, -1, width - 1).astype(jnp.int32)
+    row = jnp.clip(corner_y, -1, height - 1).astype(jnp.int32)
+    weights = []
+    for down, right in _CORNERS:
+        value = jax.lax.stop_gradient(_texel(height_field, row, column, (down, right)))
         is_on_surface = value < jnp.inf
         if threshold is not None:
             is_on_surface = is_on_surface & ~is_depth_step(value, anchor, threshold)
-        weight_x = fraction_x if i else 1 - fraction_x
-        weight = weight_x * (fraction_y if j else 1 - fraction_y)
-        rows.append(row)
-        columns.append(column)
+        weight_x = fraction_x if right else 1 - fraction_x
+        weight = weight_x * (fraction_y if down else 1 - fraction_y)
         weights.append(jnp.where(is_on_surface, weight, 0))
-    return Patch(jnp.stack(rows), jnp.stack(columns), jnp.stack(weights))
+    return Patch(row, column, jnp.stack(weights))
 
 
 def is_depth_step(a: Array, b: Array, threshold: int | float) -> Array:
@@ -169,15 +182,16 @@ def _texel_miss(
     """
     x, y, z = _point_on(origin, direction, hit.time)
     dx, dy, dz = (jax.lax.stop_gradient(direction[:, k]) for k in range(3))
-    top = jnp.where(hit.mask, height_field[hit.y, hit.x], 0)
+    top = hit.read(height_field)
     zeros = [jnp.zeros_like(x)] * 4
     miss, slope = list(zeros), [jnp.ones_like(x)] * 4
     miss[TOP], slope[TOP] = z - jnp.where(jnp.isfinite(top), top, 0), dz
     miss[X_SIDE], slope[X_SIDE] = x, dx
     miss[Y_SIDE], slope[Y_SIDE] = y, dy
+    face = hit.face.astype(jnp.int32)
     return (
-        jnp.choose(hit.face, miss, mode="clip"),
-        jnp.choose(hit.face, slope, mode="clip"),
+        jnp.choose(face, miss, mode="clip"),
+        jnp.choose(face, slope, mode="clip"),
     )
 
 
@@ -199,7 +213,7 @@ def patch_point(
     # By coordinate: what a loop reads is kept as it is.
     origins, directions = ([x[:, k] for k in range(3)] for x in (origin, direction))
     held_field, o, d = hold(height_field), hold(origins), hold(directions)
-    anchor = jnp.where(hit.mask, held_field[hit.y, hit.x], 0)
+    anchor = hit.read(held_field)
 
     def patch_miss(height_field, origin, direction, time):
         x, y, z = (o + time * d for o, d in zip(origin, direction, strict=True))
@@ -210,25 +224,30 @@ def patch_point(
     )
     speed = jnp.maximum(jnp.abs(d[0]), jnp.abs(d[1]))  # texels per unit of time
     reach = jnp.where(speed > 0, _REACH_TEXELS / jnp.where(speed > 0, speed, 1), jnp.inf)
-    low = not_before_start(hit.time - reach, d[2], origin_at_end)
-    high = hit.time + reach
 
     def newton(index, state):
-        time, last_move, _ = state
+        """The time after a step, and the step's length.
+
+        In the last turn the time stays; beside it the slope, or 0 without convergence.
+        """
+        time, last_move = state
+        time, begin = kept((time, hit.time))
+        low, high = not_before_start(begin - reach, d[2], origin_at_end), begin + reach
         value, slope = value_and_slope(time)
         move = -value / jnp.where(slope > 0, slope, 1)
-        moves = (slope > 0) & (index < _NEWTON_STEPS)
-        otherwise = jnp.where(index < _NEWTON_STEPS, jnp.inf, last_move)
-        last_move = jnp.where(moves, jnp.abs(move), otherwise)
-        return jnp.where(moves, jnp.clip(time + move, low, high), time), last_move, slope
+        is_last = index == _NEWTON_STEPS
+        has_converged = last_move * speed < _CONVERGED_TEXELS
+        last_move = jnp.where(slope > 0, jnp.abs(move), jnp.inf)
+        moves = (slope > 0) & ~is_last
+        time = jnp.where(moves, jnp.clip(time + move, low, high), time)
+        return time, jnp.where(is_last, jnp.where(has_converged, slope, 0), last_move)
 
-    # One more iteration only computes the slope at the end. A loop's result is stored; outside
-    # of the loop, XLA would compute the slope again wherever it is used.
-    start = hit.time, jnp.full_like(hit.time, jnp.inf), jnp.ones_like(hit.time)
-    time, last_move, slope = fori_loop(0, _NEWTON_STEPS + 1, newton, start)
+    # One more turn only computes the slope at the end. A loop's result is stored; outside of
+    # the loop, XLA would compute the slope again wherever it is used. The first turn reads the
+    # time alone.
+    time, slope = fori_loop(0, _NEWTON_STEPS + 1, newton, (hit.time, hit.time))
     terms = jnp.abs(d[2]) + jnp.abs(slope - d[2])
-    is_steep = slope > _MIN_SLOPE * terms
-    is_on_patch = is_steep & (last_move * speed < _CONVERGED_TEXELS) & hit.mask
+    is_on_patch = (slope > _MIN_SLOPE * terms) & hit.mask
     time = jnp.where(is_on_patch, time, hit.time)
     texel_miss, texel_slope = _texel_miss(height_field, origin, direction, hit)
     miss = patch_miss(height_field, origins, directions, time)

@@ -266,6 +266,6 @@ def _gap(height_field: Array, r: GridRays, time: Array) -> Float[Array, " ray"]:
 def _texel_hit(height_field, r, time, x, y, mask, steps) -> TexelHit:
     """The record of a hit on a top; at the start time the ray is inside the column."""
     height, width = height_field.shape
-    x, y = jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1)
-    face = jnp.where(time > start_time(r.dz, r.origin_at_end), TOP, START)
+    x, y = (jnp.clip(v, 0, size - 1).astype(jnp.int16) for v, size in ((x, width), (y, height)))
+    face = jnp.where(time > start_time(r.dz, r.origin_at_end), TOP, START).astype(jnp.int8)
     return TexelHit(time, x, y, face, mask, steps.astype(jnp.int32), jnp.zeros_like(mask))

@@ -196,7 +196,8 @@ def traverse(
         texel_hits = jax.lax.map(lambda batch: hits(batch, _step_packed), split)
         return jax.tree.map(lambda x: x.reshape(-1)[:count], texel_hits)
 
-    all_at_once = lambda *rays: hits(rays, _step_all)
+    # Kept in memory: who reads the hits would else keep the rays to compute them again.
+    all_at_once = lambda *rays: jax.lax.optimization_barrier(hits(rays, _step_all))
     return by_platform(origin, direction, cpu=in_batches, accelerator=all_at_once)
 
 
@@ -233,9 +234,9 @@ def _texel_hits(pyramid: Pyramid, r: GridRays, state: Array, steps: Array) -> Te
     face = jnp.where(entry_time == start_time(r.dz, r.origin_at_end), START, face)
     return TexelHit(
         time=jnp.where(on_top, reach_time, entry_time),
-        x=x,
-        y=y,
-        face=jnp.where(on_top, TOP, face),
+        x=x.astype(jnp.int16),
+        y=y.astype(jnp.int16),
+        face=jnp.where(on_top, TOP, face).astype(jnp.int8),
         mask=level == HIT,
         steps=steps,
         exhausted=level < MISS,

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._numerics import normalize
-from jaxfx._platform import by_platform
+from jaxfx._platform import by_platform, kept
 from jaxfx.camera import Camera, PinholeCamera
 from jaxfx.camera.rigid import per_depth
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, start_time
@@ -87,18 +87,20 @@ def trace_pixels(
     is_in_front = hold(ray[0][:, 2] + hit.time * ray[1][:, 2]) <= 0
     hit = hit._replace(mask=hit.mask & rays.inside & is_in_front)
     is_behind_gap = _comes_through_gap(hold(inverse_depth), *hold(ray), hit, hole_threshold)
+    is_behind_gap, time = kept((is_behind_gap, hit.time))
+    hit = hit._replace(time=time)
     point = patch_point(inverse_depth, *ray, hit, hole_threshold, origin_at_end=True)
-    x, y, z = (point.position[:, k] for k in range(3))
+    x, y, z = kept([point.position[:, k] for k in range(3)])
     column, row = (
         jnp.clip(jnp.floor(v), 0, size - 1).astype(jnp.int32)
         for v, size in ((x, width), (y, height))
     )
-    anchor = jnp.where(hit.mask, hold(inverse_depth)[hit.y, hit.x], 0)
+    anchor = hit.read(hold(inverse_depth))
     # The stencil of a surface extends into a hole beside it; the surface does not.
     is_visible = hit.mask & ~is_behind_gap & is_known[row, column]
     patch = edge_aware_patch(inverse_depth, x, y, anchor, hole_threshold)
     patch = patch._replace(weights=jnp.where(is_visible[None], patch.weights, 0))
-    return View(jnp.stack([x, y], axis=-1), -z / unit, is_visible, patch, hit.steps)
+    return kept(View(jnp.stack([x, y], axis=-1), -z / unit, is_visible, patch, hit.steps))
 
 
 def _comes_through_gap(
@@ -113,7 +115,7 @@ def _comes_through_gap(
     height, width = inverse_depth.shape
     back_x = jnp.where(hit.face == X_SIDE, -jnp.sign(direction[:, 0]), 0).astype(jnp.int32)
     back_y = jnp.where(hit.face == Y_SIDE, -jnp.sign(direction[:, 1]), 0).astype(jnp.int32)
-    x, y = hit.x + back_x, hit.y + back_y
+    x, y = hit.x.astype(jnp.int32) + back_x, hit.y.astype(jnp.int32) + back_y
     float_type = jnp.finfo(inverse_depth.dtype)
     speed = jnp.maximum(jnp.abs(direction[:, 0]), jnp.abs(direction[:, 1]))
     texels_passed = (hit.time - start_time(direction[:, 2], origin_at_end=True)) * speed
@@ -121,7 +123,7 @@ def _comes_through_gap(
     is_at_start = is_at_start & (hit.face != TOP)
     has_previous = (x >= 0) & (x < width) & (y >= 0) & (y < height) & ~is_at_start
     previous = inverse_depth[jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1)]
-    texel = jnp.where(hit.mask, inverse_depth[hit.y, hit.x], 0)
+    texel = hit.read(inverse_depth)
     # The nearest that the ray may be: its two terms are rounded, and may cancel.
     travelled = hit.time * direction[:, 2]
     terms = jnp.abs(origin[:, 2]) + jnp.abs(travelled)
