@@ -26,7 +26,10 @@ Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 # Our own solver has also converged after this many steps in a row that each lower the loss by
 # less than this ratio: in float32 rounding hides from its own test that it has arrived. With
 # fewer steps or a larger ratio it stops on a slope, with more it wanders about the minimum.
-PATIENCE, GAIN = 6, 1e-5
+PATIENCE, GAIN = 3, 1e-5
+
+# How many times as long as a Gauss-Newton step a step may be: see `LevenbergMarquardt`.
+_LONGEST = 5.0
 
 
 _Item: Any = type(optx.RESULTS.successful)
@@ -201,7 +204,7 @@ def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Lin
 
 @functools.cache
 def _default_solver() -> LevenbergMarquardt:
-    return LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, longest=_LONGEST)
 
 
 _REST = {"args": None, "options": {}, "tags": frozenset()}
