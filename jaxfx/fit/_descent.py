@@ -255,11 +255,11 @@ def _loss(fn, y):
 # share one program.
 
 
-def _arrays_of(state: Any) -> list[Array]:
+def _arrays_of(state: Any) -> list[Any]:
     return jax.tree.leaves(eqx.filter(state, eqx.is_array))
 
 
-def _state_with(solver: Any, fn: _Objective, y: Any, arrays: list[Array]) -> Any:
+def _state_with(solver: Any, fn: _Objective, y: Any, arrays: list[Any]) -> Any:
     """A solver's state that has these arrays."""
     initial, rest = eqx.partition(_initial_state(solver, fn, y), eqx.is_array)
     return eqx.combine(jax.tree.unflatten(jax.tree.structure(initial), arrays), rest)

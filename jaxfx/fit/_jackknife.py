@@ -95,7 +95,9 @@ def principal(columns: Float[Array, "residual unknown"]) -> Principal:
     is_told = norms > 0
     norms = jnp.where(is_told, norms, 1)
     scaled = columns / norms[None]
-    vectors = jnp.linalg.eigh(scaled.T @ scaled)[1]
+    # Away from all others, so that rounding mixes what is not told with none of them.
+    apart = jnp.diag(jnp.where(is_told, 0, -1).astype(columns.dtype))
+    vectors = jnp.linalg.eigh(scaled.T @ scaled + apart)[1]
     along = scaled @ vectors
     return Principal(along, vectors / norms[:, None], jnp.sum(along**2, axis=0), is_told)
 

@@ -27,6 +27,10 @@ from jaxfx._loops import varying_as
 _ACCEPTED, _GOOD, _LONGER, _SHORTER = 0.01, 0.99, 3.5, 0.25
 
 
+# The cosine of the angle between two steps, as they change the residual, above which the second
+# goes on where the first went. With less, steps across a valley are lengthened too.
+_SAME_WAY = 0.9
+
 _RESULTS: Any = optx.RESULTS
 
 
@@ -162,8 +166,11 @@ def _after(
     triangle = chosen(triangle, state.triangle)
     here = chosen(tried, here)
     found = (change - slope) / jnp.where(square > 0, square, 1)
-    curvature = jnp.where(accepted & (square > 0), found, 1).clip(1 / solver.longest, 1)
-    step = _damped(triangle, radius) / curvature
+    step = _damped(triangle, radius)
+    goes_on = _cosine(triangle[:, :-1] @ moved, -triangle[:, :-1] @ step) > _SAME_WAY
+    curvature = jnp.where(accepted & (square > 0) & goes_on, found, 1)
+    curvature = curvature.clip(1 / solver.longest, 1)
+    step = step / curvature
     is_finite = jnp.all(jnp.isfinite(step))
     result = _RESULTS.where(is_finite, _RESULTS.successful, _RESULTS.singular)
     after = _State(
@@ -180,6 +187,12 @@ def _after(
     # What is reported belongs to the unknowns before the step.
     before = jax.tree.map(lambda *x: jnp.where(state.is_first, *x), aux, state.aux)
     return unravel(here), after, before
+
+
+def _cosine(a: Array, b: Array) -> Float[Array, ""]:
+    """Of the angle between two vectors; 0 for one of length 0."""
+    lengths = jnp.linalg.norm(a) * jnp.linalg.norm(b)
+    return jnp.dot(a, b) / jnp.where(lengths > 0, lengths, 1)
 
 
 def _triangle(matrix: Float[Array, "row column"]) -> Float[Array, "few column"]:

@@ -52,3 +52,16 @@ def test_intervals_hold_the_true_lens_of_a_photograph_by_many_passes():
     held = np.abs(errors) < 1.96 * np.array(stated)
     assert np.sum(is_told) >= 14
     assert held[is_told].mean(axis=0).min() >= 0.85
+
+
+def test_an_unknown_that_changes_nothing_leaves_the_other_errors_as_they_are():
+    """Two of the others are hard to tell apart: rounding mixes it with their difference."""
+    rng = np.random.default_rng(3)
+    columns, widening = rng.normal(size=(480, 4)), jnp.asarray(rng.normal(size=480))
+    columns[:, 1] = columns[:, 0] + 1e-5 * columns[:, 1]
+    defocus = jnp.asarray(rng.uniform(-6, 6, (1, 20, 24)))
+    alone = _circle_error.variances(jnp.asarray(columns), widening, defocus)
+    for at in range(5):
+        beside = jnp.asarray(np.insert(columns, at, 0, axis=1))
+        found = np.delete(_circle_error.variances(beside, widening, defocus), at)
+        np.testing.assert_allclose(found, alone, rtol=1e-9)
