@@ -26,10 +26,7 @@ Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 # Our own solver has also converged after this many steps in a row that each lower the loss by
 # less than this ratio: in float32 rounding hides from its own test that it has arrived. With
 # fewer steps or a larger ratio it stops on a slope, with more it wanders about the minimum.
-PATIENCE, GAIN = 3, 1e-5
-
-# How many times as long as a Gauss-Newton step a step may be: see `LevenbergMarquardt`.
-_LONGEST = 5.0
+PATIENCE, GAIN = 6, 1e-5
 
 
 _Item: Any = type(optx.RESULTS.successful)
@@ -90,6 +87,7 @@ def descend(
     bar: Bar,
     patience: Any = PATIENCE,
     gain: Any = GAIN,
+    longest: float = 1.0,
 ) -> End:
     """Search from a start for the least mean square of a residual.
 
@@ -97,10 +95,11 @@ def descend(
     array of that type. Its class and its shapes decide whether a program is compiled: searches
     that differ in the numbers alone share one. Without a `solver` it is Levenberg-Marquardt,
     which has also converged when `patience` steps in a row each lower the loss by less than
-    `gain`, a ratio. A search that leaves the finite numbers ends at the best unknowns before.
+    `gain`, a ratio, and whose steps may be `longest` times as long. A search that leaves the
+    finite numbers ends at the best unknowns before.
     """
     patience = patience if solver is None else max_steps
-    solver = _default_solver() if solver is None else solver
+    solver = _default_solver(longest) if solver is None else solver
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     if not is_concrete(residual, unknowns):
         return _descend_in_program(solver, fn, unknowns, max_steps, patience, gain)
@@ -203,8 +202,8 @@ def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Lin
 
 
 @functools.cache
-def _default_solver() -> LevenbergMarquardt:
-    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, longest=_LONGEST)
+def _default_solver(longest: float = 1.0) -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, longest=longest)
 
 
 _REST = {"args": None, "options": {}, "tags": frozenset()}
