@@ -34,9 +34,7 @@ _CONVERGED_TEXELS = 1e-2
 # A ratio of the slope of `miss` to the size of its terms. Below it a ray grazes the patch, and
 # the derivative, divided by the slope, would be mostly rounding error.
 _MIN_SLOPE = 1e-3
-
-
-# The texels of a stencil, down and to the right of its first.
+# The texels of a stencil: how far down and to the right of its first.
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
@@ -70,7 +68,7 @@ class Patch(NamedTuple):
         channel. On an accelerator all is read at once.
         """
 
-        def add(total: Array, texel: tuple[Any, Array]) -> Any:
+        def add(total: Array, texel: Any) -> tuple[Array, None]:
             corner, weight = texel
             color = _texel(image, self.row, self.column, corner)
             weight = jnp.broadcast_to(weight[:, None], color.shape)
@@ -92,8 +90,11 @@ class Patch(NamedTuple):
 
 
 def _texel(
-    values: Float[Array, "height width *channel"], row: Array, column: Array, corner: Any
-):
+    values: Float[Array, "height width *channel"],
+    row: Int[Array, " ray"],
+    column: Int[Array, " ray"],
+    corner: tuple[int, int] | Int[Array, "2"],
+) -> Float[Array, "ray *channel"]:
     """The texel of each stencil in one of its corners."""
     down, right = corner
     height, width = values.shape[:2]
