@@ -87,7 +87,6 @@ def descend(
     bar: Bar,
     patience: Any = PATIENCE,
     gain: Any = GAIN,
-    longest: float = 1.0,
 ) -> End:
     """Search from a start for the least mean square of a residual.
 
@@ -95,11 +94,10 @@ def descend(
     array of that type. Its class and its shapes decide whether a program is compiled: searches
     that differ in the numbers alone share one. Without a `solver` it is Levenberg-Marquardt,
     which has also converged when `patience` steps in a row each lower the loss by less than
-    `gain`, a ratio, and whose steps may be `longest` times as long. A search that leaves the
-    finite numbers ends at the best unknowns before.
+    `gain`, a ratio. A search that leaves the finite numbers ends at the best unknowns before.
     """
     patience = patience if solver is None else max_steps
-    solver = _default_solver(longest) if solver is None else solver
+    solver = _default_solver() if solver is None else solver
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     if not is_concrete(residual, unknowns):
         return _descend_in_program(solver, fn, unknowns, max_steps, patience, gain)
@@ -202,8 +200,8 @@ def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Lin
 
 
 @functools.cache
-def _default_solver(longest: float = 1.0) -> LevenbergMarquardt:
-    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, longest=longest)
+def _default_solver() -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=1e-4, atol=1e-5)
 
 
 _REST = {"args": None, "options": {}, "tags": frozenset()}

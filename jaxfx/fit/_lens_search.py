@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,11 +51,8 @@ _HANDICAP = 1.01
 
 # When a search whose end is another's start has converged: see `descend`.
 _SOON = {"patience": 2, "gain": 1e-3}
-# How a search on the images as given goes on and converges: see `descend`. On small images
-# longer steps may lead into the valley of another lens; here they only shorten the way, and
-# fewer of them are enough to see that it has ended.
-_LONG: dict[str, Any] = {"longest": 5.0}
-_LAST: dict[str, Any] = {**_LONG, "patience": 3}
+# When the last search has: each more step costs as much as all of a small image's.
+_LAST = {"patience": 3}
 
 
 class Search(NamedTuple):
@@ -110,13 +107,11 @@ class Search(NamedTuple):
         """The ends of searches from several starts."""
         return each(lambda start: self._refine(residual, start), starts, residual)
 
-    def _refine(
-        self, residual: Residual, unknowns: Values, has_edges: bool = False, **options: Any
-    ) -> End:
+    def _refine(self, residual: Residual, unknowns: Values, has_edges: bool = False) -> End:
         """A search whose end is another's start, at the noise of its own start."""
         if self.is_robust:
             residual = weighed(residual, unknowns, has_edges)
-        return self.solve(residual, unknowns, **_SOON, **options)
+        return self.solve(residual, unknowns, **_SOON)
 
     def _beside_edges(self, residual: Residual, unknowns: Values) -> list[End]:
         """Two searches in which edges have a noise of their own, the better one first.
@@ -149,7 +144,7 @@ class Search(NamedTuple):
             model = self._with_bound(model, model.values(unknowns), _MARGIN)
             residual = self.residual(model)
             if self.is_robust:
-                end = self._refine(residual, unknowns, has_edges=True, **_LONG)
+                end = self._refine(residual, unknowns, has_edges=True)
                 unknowns, losses = end.unknowns, losses + end.losses
                 residual = weighed(residual, unknowns, True)
             end = self.solve(residual, unknowns, **_LAST)

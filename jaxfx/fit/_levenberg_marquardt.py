@@ -27,10 +27,6 @@ from jaxfx._loops import varying_as
 _ACCEPTED, _GOOD, _LONGER, _SHORTER = 0.01, 0.99, 3.5, 0.25
 
 
-# The cosine of the angle between two steps, as they change the residual, above which the second
-# goes on where the first went. With less, steps across a valley are lengthened too.
-_SAME_WAY = 0.9
-
 _RESULTS: Any = optx.RESULTS
 
 
@@ -42,8 +38,6 @@ class _State(NamedTuple):
     - `triangle`: R of the QR decomposition of the Jacobian with the residual as its last
       column: all that a step and its promise depend on.
     - `radius`: the inverse of the damping.
-    - `curvature`: that of the loss along the last accepted step, as a ratio to that of the
-      Jacobian's square.
     """
 
     is_first: Bool[Array, ""]
@@ -52,7 +46,6 @@ class _State(NamedTuple):
     triangle: Float[Array, "row column"]
     aux: Any
     radius: Float[Array, ""]
-    curvature: Float[Array, ""]
     has_converged: Bool[Array, ""]
     result: optx.RESULTS
 
@@ -63,18 +56,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     It has converged where an accepted step changes unknowns and residual by less than
     `atol + rtol * abs(value)`, each of them.
 
-    The derivative of a rendered image has a ripple that ends within a fraction of a pixel: the
-    Jacobian's square is then larger than the curvature of the loss, and all steps are too short
-    by one ratio. So a step is longer by as much as the last one gained more than was promised,
-    up to `longest` times.
-
     Source: Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters".
-    Our own: the triangle that stands for Jacobian and residual, and the longer steps.
+    Our own: the triangle that stands for Jacobian and residual.
     """
 
     rtol: float
     atol: float
-    longest: float = 1.0
     norm: Callable[[Any], Array] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
@@ -89,7 +76,6 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             jnp.zeros(f_struct.size, f_struct.dtype),
             jnp.zeros((min(f_struct.size, columns), columns), unknowns.dtype),
             jax.tree.map(zeros, aux_struct),
-            jnp.ones((), unknowns.dtype),
             jnp.ones((), unknowns.dtype),
             jnp.asarray(False),
             optx.RESULTS.successful,
@@ -145,10 +131,10 @@ def _after(
     triangle = _triangle(jnp.concatenate([jacobian, residual[:, None]], axis=1))
 
     moved = tried - here
-    # The loss along the step: its slope, and its curvature by the Jacobian alone.
-    along = state.triangle[:, :-1] @ moved
-    slope, square = jnp.sum(along * state.triangle[:, -1]), jnp.sum(along**2) / 2
-    promised = slope + state.curvature * square
+    promised = (
+        jnp.sum((state.triangle @ jnp.append(moved, 1)) ** 2)
+        - jnp.sum(state.triangle[:, -1] ** 2)
+    ) / 2
     change = (jnp.sum(residual**2) - jnp.sum(state.residual**2)) / 2
     is_good = ~state.is_first & (promised < 0) & (change < _GOOD * promised)
     accepted = state.is_first | (change <= _ACCEPTED * promised)
@@ -165,12 +151,7 @@ def _after(
     )
     triangle = chosen(triangle, state.triangle)
     here = chosen(tried, here)
-    found = (change - slope) / jnp.where(square > 0, square, 1)
     step = _damped(triangle, radius)
-    goes_on = _cosine(triangle[:, :-1] @ moved, -triangle[:, :-1] @ step) > _SAME_WAY
-    curvature = jnp.where(accepted & (square > 0) & goes_on, found, 1)
-    curvature = curvature.clip(1 / solver.longest, 1)
-    step = step / curvature
     is_finite = jnp.all(jnp.isfinite(step))
     result = _RESULTS.where(is_finite, _RESULTS.successful, _RESULTS.singular)
     after = _State(
@@ -180,19 +161,12 @@ def _after(
         triangle,
         chosen(aux, state.aux),
         radius,
-        curvature.astype(radius.dtype),
         has_converged,
         result,
     )
     # What is reported belongs to the unknowns before the step.
     before = jax.tree.map(lambda *x: jnp.where(state.is_first, *x), aux, state.aux)
     return unravel(here), after, before
-
-
-def _cosine(a: Array, b: Array) -> Float[Array, ""]:
-    """Of the angle between two vectors; 0 for one of length 0."""
-    lengths = jnp.linalg.norm(a) * jnp.linalg.norm(b)
-    return jnp.dot(a, b) / jnp.where(lengths > 0, lengths, 1)
 
 
 def _triangle(matrix: Float[Array, "row column"]) -> Float[Array, "few column"]:

@@ -47,10 +47,10 @@ def test_equal_defocus_shares_a_stratum_and_missing_depth_spoils_none():
 @pytest.mark.usefixtures("optimised")
 def test_intervals_hold_the_true_lens_of_a_photograph_by_many_passes():
     """Rooms on which nothing was chosen; `python -m benchmarks.fit_coverage` fits 120."""
-    errors, stated, doubts = zip(*map(fit_coverage.fitted, range(300, 332)), strict=True)
+    errors, stated, doubts = zip(*map(fit_coverage.fitted, range(300, 316)), strict=True)
     is_told = [not doubt for doubt in doubts]
     held = np.abs(errors) < 1.96 * np.array(stated)
-    assert np.sum(is_told) >= 28
+    assert np.sum(is_told) >= 14
     assert held[is_told].mean(axis=0).min() >= 0.85
 
 
