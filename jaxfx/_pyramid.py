@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxfx._platform import kept
+
 
 @final
 class Pyramid(eqx.Module):
@@ -67,5 +69,6 @@ def _pyramid(values: Array, combine: Callable, identity: float) -> Pyramid:
         padding = [(0, 2 * height - finer.shape[0], 0), (0, 2 * width - finer.shape[1], 0)]
         padded = jax.lax.pad(finer, jnp.asarray(identity, finer.dtype), padding)
         rows = combine(padded[::2], padded[1::2])
-        levels.append(combine(rows[:, ::2], rows[:, 1::2]))
+        level = combine(rows[:, ::2], rows[:, 1::2])
+        levels.append(kept(level) if len(levels) % 2 == 0 else level)
     return Pyramid(jnp.concatenate([level.reshape(-1) for level in levels]), shapes)

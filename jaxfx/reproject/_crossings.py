@@ -9,6 +9,7 @@ coordinate z that grows away from the viewer. In `warp` it is the inverse depth 
 camera, in `intersect` the depth itself.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -86,8 +87,20 @@ def grid_rays(
     origin: Float[Array, "ray 3"], direction: Float[Array, "ray 3"], origin_at_end: bool = False
 ) -> GridRays:
     """Rays by coordinate. Where x or y is constant, it is moved to the middle of its texels."""
-    dx, dy, dz = (jnp.where(d == 0, 0, d) for d in (direction[:, k] for k in range(3)))
-    ox, oy, oz = (origin[:, k] for k in range(3))
+    return grid_rays_of(coordinates(origin), coordinates(direction), origin_at_end)
+
+
+def coordinates(points: Float[Array, "ray 3"]) -> list[Float[Array, " ray"]]:
+    """x, y and z of points or directions, each an array over rays."""
+    return [points[:, k] for k in range(3)]
+
+
+def grid_rays_of(
+    origin: Sequence[Array], direction: Sequence[Array], origin_at_end: bool
+) -> GridRays:
+    """`grid_rays` of origins and directions that are given by coordinate."""
+    dx, dy, dz = (jnp.where(d == 0, 0, d) for d in direction)
+    ox, oy, oz = origin
     ox = jnp.where(dx == 0, jnp.floor(ox) + 0.5, ox)
     oy = jnp.where(dy == 0, jnp.floor(oy) + 0.5, oy)
     return GridRays(ox, oy, oz, dx, dy, dz, 1 / dx, 1 / dy, 1 / dz, origin_at_end)

@@ -62,7 +62,18 @@ class Patch(NamedTuple):
         return safe_divide(total, jnp.sum(self.weights, axis=0))
 
     def read_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
-        """The weighted mean of each channel: ray channel.
+        """The weighted mean of each channel: ray channel."""
+        return self.normalized(image.dtype).sum_colors(image)
+
+    def normalized(self, dtype: jnp.dtype) -> "Patch":
+        """The stencil with weights whose sum is 1, or that are all 0, in another type."""
+        weights = self.weights.astype(dtype)
+        weight_sum = jnp.sum(weights, axis=0, keepdims=True)
+        weights = safe_divide(weights, jnp.broadcast_to(weight_sum, weights.shape))
+        return self._replace(weights=weights)
+
+    def sum_colors(self, image: Float[Array, "height width channel"]) -> Float[Array, "..."]:
+        """The weighted sum of each channel: ray channel.
 
         On a CPU `scan` stores the stencil. Without it, XLA would fuse the search into each
         channel. On an accelerator all is read at once.
@@ -82,11 +93,8 @@ class Patch(NamedTuple):
                 total, _ = add(total, texel)
             return total
 
-        weights = self.weights.astype(image.dtype)
-        weight_sum = jnp.sum(weights, axis=0, keepdims=True)
-        weights = safe_divide(weights, jnp.broadcast_to(weight_sum, weights.shape))
-        total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
-        return by_platform(total, weights, cpu=in_turn, accelerator=at_once)
+        total = jnp.zeros((self.weights.shape[1], image.shape[2]), image.dtype)
+        return by_platform(total, self.weights, cpu=in_turn, accelerator=at_once)
 
 
 def _texel(

@@ -21,6 +21,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, UInt32
 
 from jaxfx._loops import while_loop
@@ -36,10 +37,12 @@ from jaxfx.reproject._crossings import (
     TexelHit,
     axis_entries,
     backward_axes,
+    coordinates,
     crossing_moment,
     earlier,
     entry_texel,
     grid_rays,
+    grid_rays_of,
     is_earlier,
     start_time,
     texel_at,
@@ -179,25 +182,26 @@ def traverse(
     nearest = jnp.min(jnp.where(is_finite, height_field, jnp.inf))
     thickness = jnp.max(jnp.where(is_finite, height_field, -jnp.inf)) - nearest
 
-    def hits(rays, step_all):
-        origin, direction = rays
-        r = grid_rays(origin, direction, origin_at_end)
-        state, steps = _first_states(pyramid, thickness, r)
-        return _texel_hits(pyramid, r, *step_all(pyramid, r, state, steps, limit))
+    def hits(rays):
+        r = grid_rays(*rays, origin_at_end)
+        states = _first_states(pyramid, thickness, r)
+        return _texel_hits(pyramid, r, *_step_packed(pyramid, r, *states, limit))
 
     def in_batches(*rays):
         count = len(origin)
         batches = -(-count // _BATCH_RAYS)
         if batches <= 1:
-            return hits(rays, _step_packed)
+            return hits(rays)
         size = _whole_lanes(count / batches)
         padding = ((0, batches * size - count), (0, 0))
         split = tuple(jnp.pad(x, padding).reshape(batches, size, 3) for x in rays)
-        texel_hits = jax.lax.map(lambda batch: hits(batch, _step_packed), split)
+        texel_hits = jax.lax.map(hits, split)
         return jax.tree.map(lambda x: x.reshape(-1)[:count], texel_hits)
 
-    # Kept in memory: who reads the hits would else keep the rays to compute them again.
-    all_at_once = lambda *rays: jax.lax.optimization_barrier(hits(rays, _step_all))
+    def all_at_once(*rays):
+        rays = [coordinates(x) for x in rays]
+        return _all_hits(pyramid, thickness, rays, limit, origin_at_end)
+
     return by_platform(origin, direction, cpu=in_batches, accelerator=all_at_once)
 
 
@@ -279,30 +283,60 @@ def _step_packed(pyramid, r, state, steps, max_steps):
     return state, steps
 
 
-def _step_all(pyramid, r, state, steps, max_steps):
-    """The final states and step counts on an accelerator: all rays step to the end.
+def _all_hits(pyramid, thickness, rays, max_steps, origin_at_end) -> TexelHit:
+    """The hits on an accelerator: all rays step to the end.
+
+    - `rays`: origins and directions by coordinate. What a step needs beside them it computes
+      again, which takes less time than to read it.
 
     Where nothing bounds the steps the loop does not read their counts: XLA then leaves out
     those that nobody asks for, and keeps one state per ray instead of seven.
     """
 
+    def read(rays, *states):
+        """The rays on the grid, and the states, out of memory.
+
+        XLA else keeps the reciprocals through the loop, or joins a step with the next.
+        """
+        rays, *states = jax.lax.optimization_barrier((rays, *states))
+        return grid_rays_of(*rays, origin_at_end), *states
+
+    is_endless = max_steps == np.iinfo(np.int32).max
+
     def is_unfinished(state, steps):
-        if max_steps == np.iinfo(np.int32).max:
+        if is_endless:
             return level_of(state) < MISS
         return _is_unfinished(state, steps, max_steps)
 
     def goes_on(carry):
-        return jnp.any(is_unfinished(*carry))
+        return _any(is_unfinished(*carry))
 
     def body(carry):
         state, steps = carry
         for _ in range(_STEPS_PER_CHECK):
+            r, state = read(rays, state)
             unfinished = is_unfinished(state, steps)
-            state = jnp.where(unfinished, step(pyramid, r, state), state)
+            after = step(pyramid, r, state)
+            state = after if is_endless else jnp.where(unfinished, after, state)
             steps = steps + unfinished.astype(jnp.int32)
         return state, steps
 
-    return while_loop(goes_on, body, (state, steps))
+    r, *_ = read(rays)
+    state, steps = while_loop(goes_on, body, _first_states(pyramid, thickness, r))
+    r, state = read(rays, state)
+    # Kept in memory: who reads the hits would else compute them again.
+    return jax.lax.optimization_barrier(_texel_hits(pyramid, r, state, steps))
+
+
+@custom_vmap
+def _any(flags: Bool[Array, "*ray"]) -> Bool[Array, ""]:
+    """Whether any flag is set, of a batch in any of its members."""
+    return jnp.any(flags)
+
+
+@_any.def_vmap
+def _any_of_batch(_size, is_batched, flags):
+    return _any(flags), False
 
 
 def _is_unfinished(state: Array, steps: Array, max_steps: int) -> Bool[Array, " ray"]:

@@ -14,7 +14,7 @@ from jaxfx._checks import Number, WholeNumber, check_map, whole_number
 from jaxfx._choice import Choice
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import safe_divide
-from jaxfx._platform import by_platform
+from jaxfx._platform import by_platform, kept
 from jaxfx._sampling import pixel_centers
 from jaxfx._xla import sum_planes
 from jaxfx.camera import Camera, PinholeCamera
@@ -113,43 +113,45 @@ def _blended(
 
     `size` is height and width of the result in pixels, `options` are those of `trace_pixels`.
     """
+    dtype = images[0].dtype
 
     def warped(pixels: Array, image: Array, depth: Array, camera: PinholeCamera) -> tuple:
         view, cosine, target_depth = trace_with_angle(depth, camera, target, pixels, **options)
-        colors = view.patch.read_colors(image).astype(images[0].dtype)
+        colors = view.patch.read_colors(image).astype(dtype)
         return colors, view.mask, cosine, target_depth
 
-    def weights_of(mask: Array, cosine: Array, target_depth: Array) -> Array:
-        """The weight of each camera in each pixel, camera pixel 1."""
+    def shares_of(mask: Array, cosine: Array, target_depth: Array) -> tuple[Array, Array]:
+        """The share of each camera in each pixel, camera pixel, and their sum, 1 or 0."""
         nearest = jnp.min(jnp.where(mask, target_depth, jnp.inf), axis=0)
         is_in_front = mask & (target_depth <= (1 + options["hole_threshold"]) * nearest[None])
-        weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0))[..., None]
-        return weight.astype(images[0].dtype)
-
-    def mean(total: Array, weight: Array) -> tuple[Array, Array]:
-        weight_sum = jnp.broadcast_to(sum_planes(weight), total.shape)
-        alpha = (weight_sum[:, 0] > 0).astype(total.dtype)
-        return safe_divide(total, weight_sum), alpha
+        weight = jax.lax.stop_gradient(jnp.where(is_in_front, cosine**8, 0)).astype(dtype)
+        weight_sum = sum_planes(weight)
+        shares = safe_divide(weight, jnp.broadcast_to(weight_sum, weight.shape))
+        return shares, (weight_sum > 0).astype(dtype)
 
     def blended(pixels: Array) -> tuple[Array, Array]:
         of_source = functools.partial(warped, pixels)
         colors, *found = _over_cameras(of_source, images, depths, cameras)
-        weight = weights_of(*found)
-        return mean(sum_planes(jnp.where(weight > 0, colors, 0) * weight), weight)
+        shares, alpha = shares_of(*found)
+        shares = shares[..., None]
+        return sum_planes(jnp.where(shares > 0, colors, 0) * shares), alpha
 
     def traced(pixels: Array, depth: Array, camera: PinholeCamera) -> tuple:
         view, cosine, target_depth = trace_with_angle(depth, camera, target, pixels, **options)
-        return view.patch, view.mask, cosine, target_depth
+        return view.patch.normalized(dtype), view.mask, cosine, target_depth
 
     def of_all_rays(pixels: Array) -> tuple[Array, Array]:
         of_source = functools.partial(traced, pixels)
         patches, *found = _over_cameras(of_source, depths, cameras)
-        weights, weighted = weights_of(*found), []
-        for k, (image, weight) in enumerate(zip(images, weights, strict=True)):
+        shares, alpha = shares_of(*found)
+        patches = patches._replace(weights=patches.weights * shares[:, None])
+        total = jnp.zeros((len(pixels), images[0].shape[2]), dtype)
+        for k, image in enumerate(images):
+            # All sources then have the same kernel: it is not known whose patches it reads.
+            k = jax.lax.optimization_barrier(jnp.int32(k))
             patch = jax.tree.map(lambda x, k=k: x[k], patches)
-            colors = patch.read_colors(image).astype(weights.dtype)
-            weighted.append(jnp.where(weight > 0, colors, 0) * weight)
-        return mean(functools.reduce(jnp.add, weighted), weights)
+            total = kept(total + patch.sum_colors(image))
+        return total, alpha
 
     def in_parts(pixels: Array) -> tuple[Array, Array]:
         parts = -(-len(images) * len(pixels) // _RAYS_AT_ONCE)

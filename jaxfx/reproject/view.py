@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._numerics import normalize
-from jaxfx._platform import by_platform, kept
+from jaxfx._platform import kept
 from jaxfx.camera import Camera, PinholeCamera
 from jaxfx.camera.rigid import per_depth
 from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, start_time
@@ -74,14 +74,6 @@ def trace_pixels(
         inverse_depth, rays.origin, rays.direction, search, max_steps, origin_at_end=True
     )
 
-    def computed_again(rays, pixels, time):
-        pixels, _ = jax.lax.optimization_barrier((pixels, time))
-        return view_rays(camera, target, pixels, height=height, width=width, unit=unit)
-
-    # An accelerator has them twice rather than keep both forms while the rays are stepped.
-    rays = by_platform(
-        rays, pixels, hit.time, cpu=lambda rays, *_: rays, accelerator=computed_again
-    )
     ray = rays.origin, rays.direction
     # A ray that ends at infinity may meet a surface there, but nothing beyond it.
     is_in_front = hold(ray[0][:, 2] + hit.time * ray[1][:, 2]) <= 0
