@@ -301,10 +301,8 @@ def _all_hits(pyramid, thickness, rays, max_steps, origin_at_end) -> TexelHit:
         rays, *states = jax.lax.optimization_barrier((rays, *states))
         return grid_rays_of(*rays, origin_at_end), *states
 
-    is_endless = max_steps == np.iinfo(np.int32).max
-
     def is_unfinished(state, steps):
-        if is_endless:
+        if max_steps == np.iinfo(np.int32).max:
             return level_of(state) < MISS
         return _is_unfinished(state, steps, max_steps)
 
@@ -316,8 +314,7 @@ def _all_hits(pyramid, thickness, rays, max_steps, origin_at_end) -> TexelHit:
         for _ in range(_STEPS_PER_CHECK):
             r, state = read(rays, state)
             unfinished = is_unfinished(state, steps)
-            after = step(pyramid, r, state)
-            state = after if is_endless else jnp.where(unfinished, after, state)
+            state = jnp.where(unfinished, step(pyramid, r, state), state)
             steps = steps + unfinished.astype(jnp.int32)
         return state, steps
 
