@@ -204,7 +204,7 @@ def focal_stack(
         energy = at_inverse_depth(planes.energy, candidates, start)
         tiny = jnp.finfo(dtype).tiny
         guide = image / jnp.maximum(jnp.sqrt(jnp.mean(image * image)), tiny)
-        start = settled(start, 1 / jnp.maximum(energy, tiny), guide)
+        start = settled(start, energy, guide)
         start = _filled(start, _errors(planes, candidates, start), stack)
         residual = _residual(
             stack, lenses, image, energy, candidates, start, smoothness, effect
