@@ -167,10 +167,10 @@ def focal_stack(
     `depth.fill`. From there image and depth are searched for together, by nonlinear conjugate
     gradients through the effect, with a pseudo-Huber loss, in which an image counts less where
     its circle of confusion is above 2 pixels, and a prior of the same form on second
-    differences of the inverse depth, which is less at edges of the image. More steps than the default lower the error of depth
-    where little is hidden, and let the image follow what the effect draws wrong. The standard
-    error is that of Gauss and Newton, with the image solved for, from derivatives of the
-    residuals in the window and the residuals themselves.
+    differences of the inverse depth, which is less at edges of the image. More steps than the
+    default lower the error of depth where little is hidden, and let the image follow what the
+    effect draws wrong. The standard error is that of Gauss and Newton, with the image solved
+    for, from derivatives of the residuals in the window and the residuals themselves.
 
     Known limits: within the radius of a circle of confusion from an edge in depth, a window
     shows two surfaces. Where all circles are below some 4 pixels the depth is biased, by 5 % in
