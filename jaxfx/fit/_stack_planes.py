@@ -3,9 +3,13 @@
 Where the depth is constant, an image of the stack is the all-in-focus image convolved with a
 disc. So for a candidate plane the image that explains the stack best is a quotient of Fourier
 transforms, and what is left over, in a window about a pixel, tells how well the plane fits.
+The spectra of images fall as 1 / frequency. So what is left over is led by low frequencies,
+where the blur of nearer surfaces lies; times the frequency it is led by high ones, where noise
+and aliasing lie. A plane is judged by both at once.
 """
 
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -34,12 +38,18 @@ _NOISE = 1e-2
 # reach rounds surfaces off and swallows thin ones, a smaller one leaves the blur about edges.
 # Chosen on rooms 500 to 503 of `tests/cases/rooms.py`.
 _REACH, _NEAR, _ALIKE = 4, 2.0, 0.3
+# Power of a pixel's energy by which the median trusts it less. With 1 more pixels beside edges
+# keep a wrong depth, with 3 edges go where few strong pixels want them.
+_TRUST = 2
+# Least energy, as a ratio to the mean: what fits to rounding does not outweigh all.
+_LEAST_ENERGY = 1e-6
 
 
 class Planes(NamedTuple):
     """Residual, slope and image per pixel under each candidate plane, planes first.
 
-    - `energy`: sum of squared residuals in the window, squared units of radiance.
+    - `energy`: geometric mean of two sums in the window, of squared residuals and of squared
+      residuals times frequency, squared units of radiance. White noise has as much of both.
     - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
     - `spread`: variance of the sum of residuals times derivatives.
     - `image`: the all-in-focus image if all were on the plane.
@@ -71,19 +81,22 @@ def compared(
     spectra = jnp.fft.rfft2(mirrored, axes=(1, 2))
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None])
     frequency = jnp.asarray(frequency, dtype)
+    # The mean square frequency of an image is 1 / 6: white noise keeps its power.
+    rise = (math.sqrt(6) * frequency)[..., None].astype(spectra.dtype)
 
     def image_of(spectrum: Array) -> Array:
         size, axes = (rows, columns), (-3, -2)
         whole = jnp.fft.irfft2(spectrum, s=size, axes=axes)
         return whole[..., pad : pad + height, pad : pad + width, :].astype(dtype)
 
-    def fitted(inverse_depth: Array) -> tuple[Array, Array]:
+    def fitted(inverse_depth: Array) -> tuple[Array, Array, Array]:
         circles = jnp.abs(strengths * (foci - inverse_depth))
         blurs = jax.vmap(lambda c: disc(c * frequency))(circles)[..., None]
         quotients = blurs / (jnp.sum(blurs * blurs, axis=0) + _NOISE)[None]
         blurs, quotients = (x.astype(spectra.dtype) for x in (blurs, quotients))
         sharp = jnp.sum(quotients * spectra, axis=0)
-        return image_of(spectra - blurs * sharp[None]), image_of(sharp)
+        left = spectra - blurs * sharp[None]
+        return image_of(left), image_of(rise[None] * left), image_of(sharp)
 
     def projector(inverse_depth: Array) -> Array:
         """The matrix, at each frequency, from images to residuals under one plane."""
@@ -97,17 +110,17 @@ def compared(
 
     def plane(carry: None, inverse_depth: Array) -> tuple[None, Planes]:
         one = jnp.ones_like(inverse_depth)
-        (residual, sharp), (slope, _) = jax.jvp(fitted, (inverse_depth,), (one,))
+        (residual, fine, sharp), (slope, *_) = jax.jvp(fitted, (inverse_depth,), (one,))
         over = (0, 3)
         # Noise alone has slopes too: as much, for the residuals that it leaves, as white noise.
         left, turned = jax.jvp(projector, (inverse_depth,), (one,))
         white = jnp.sum(turned * turned) / jnp.sum(left * left)
-        energy = windowed(jnp.sum(residual * residual, axis=over))
+        plain, risen = (windowed(jnp.sum(x * x, axis=over)) for x in (residual, fine))
         steepness = jnp.sum(slope * slope, axis=over)
         score = _boxed(jnp.sum(residual * slope, axis=over)) / _BLOCK
         spread = windowed(score * score + floor * steepness)
-        told = jnp.maximum(windowed(steepness) - white * energy, 0)
-        return carry, Planes(energy, told, spread, sharp)
+        told = jnp.maximum(windowed(steepness) - white * plain, 0)
+        return carry, Planes(jnp.sqrt(plain) * jnp.sqrt(risen), told, spread, sharp)
 
     return scan(plane, None, candidates)[1]
 
@@ -173,14 +186,18 @@ def best(planes: Planes, candidates: Array) -> Float[Array, "height width"]:
 @jax.jit
 def settled(
     inverse_depth: Float[Array, "height width"],
-    trust: Float[Array, "height width"],
+    energy: Float[Array, "height width"],
     guide: Float[Array, "height width channel"],
 ) -> Float[Array, "height width"]:
-    """The median about each pixel, weighted by `trust`, by nearness, and by likeness of color.
+    """The median about each pixel, weighted by trust, by nearness, and by likeness of color.
 
-    Beside an edge in depth no plane explains the images, and the trust is small: pixels take
-    there the depth of others of their color. `guide` has a root mean square of 1.
+    Beside an edge in depth no plane explains the images: the energy is large, and the trust,
+    its power of -2, small. Pixels take there the depth of others of their color. `guide` has a
+    root mean square of 1.
     """
+    mean = jnp.mean(energy)
+    least = _LEAST_ENERGY * mean + jnp.finfo(energy.dtype).tiny
+    trust = (mean / jnp.maximum(energy, least)) ** _TRUST
     height, width = inverse_depth.shape
     far = _REACH
     near = np.exp(-0.5 * (np.arange(-far, far + 1) / _NEAR) ** 2)
