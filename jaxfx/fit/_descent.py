@@ -87,6 +87,7 @@ def descend(
     bar: Bar,
     patience: Any = PATIENCE,
     gain: Any = GAIN,
+    every: int = 1,
 ) -> End:
     """Search from a start for the least mean square of a residual.
 
@@ -94,10 +95,12 @@ def descend(
     array of that type. Its class and its shapes decide whether a program is compiled: searches
     that differ in the numbers alone share one. Without a `solver` it is Levenberg-Marquardt,
     which has also converged when `patience` steps in a row each lower the loss by less than
-    `gain`, a ratio. A search that leaves the finite numbers ends at the best unknowns before.
+    `gain`, a ratio, and which computes derivatives once in `every` evaluations; for the others
+    the residual has a method `at`, which gives the same. A search that leaves the finite
+    numbers ends at the best unknowns before.
     """
     patience = patience if solver is None else max_steps
-    solver = _default_solver() if solver is None else solver
+    solver = _default_solver(every) if solver is None else solver
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     if not is_concrete(residual, unknowns):
         return _descend_in_program(solver, fn, unknowns, max_steps, patience, gain)
@@ -193,6 +196,11 @@ class _Objective(eqx.Module):
         loss = jnp.mean(residual * residual)
         return (loss if self.scalar else residual), loss
 
+    def at(self, unknowns: Any, _: None) -> tuple[Array, Array]:
+        """What a call gives, by the residual's own program `at`."""
+        residual = self.residual.at(unknowns)
+        return residual, jnp.mean(residual * residual)
+
 
 def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Linear:
     """A residual, its Jacobian and its mean square, by the program that `descend` runs."""
@@ -200,8 +208,8 @@ def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Lin
 
 
 @functools.cache
-def _default_solver() -> LevenbergMarquardt:
-    return LevenbergMarquardt(rtol=1e-4, atol=1e-5)
+def _default_solver(every: int) -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, every=every)
 
 
 _REST = {"args": None, "options": {}, "tags": frozenset()}

@@ -82,6 +82,10 @@ class Residual(eqx.Module):
     def __call__(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
         return self.weighted(self.compare(unknowns).difference)
 
+    def at(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
+        """What a call gives, by the program that the report runs."""
+        return _weighted(self, evaluate(self, unknowns).difference)
+
 
 def _log_tone(x: Array, white: Array) -> Array:
     """An odd logarithm: `x` itself where `x` is much smaller than `white`."""
@@ -105,6 +109,7 @@ def evaluate(residual: Residual, unknowns: Values) -> Comparison:
 
 
 _compare = eqx.filter_jit(Residual.compare)
+_weighted = eqx.filter_jit(Residual.weighted)
 
 
 def mean_size(residual: Residual, unknowns: Values) -> Float[Array, " photograph"]:

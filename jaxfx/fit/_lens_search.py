@@ -53,6 +53,9 @@ _HANDICAP = 1.01
 _SOON = {"patience": 2, "gain": 1e-3}
 # When the last search has: each more step costs as much as all of a small image's.
 _LAST = {"patience": 3}
+# Evaluations to one with derivatives, which costs eight times as much. Smaller numbers cost
+# time, larger ones end farther from the minimum.
+_EVERY = 8
 
 
 class Search(NamedTuple):
@@ -204,6 +207,15 @@ class Search(NamedTuple):
                 start[name] = origin[name] + (values if origin[name].ndim else values[0])
             starts.append(start)
         return starts
+
+
+def evaluations_per_jacobian(model: Model) -> int:
+    """How many evaluations a search makes to one with derivatives.
+
+    Where searches begin on the images as given, each has derivatives: they cost little there,
+    and a search with fewer may end in another minimum.
+    """
+    return _EVERY if max(model.images.depth.shape) > _COARSE else 1
 
 
 def _origin(model: Model, ratios: tuple[str, ...]) -> Values:

@@ -24,7 +24,7 @@ from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Model, Values
 from jaxfx.fit._lens_noise import defocus
 from jaxfx.fit._lens_residual import Report, Residual, Tone, plain, report
-from jaxfx.fit._lens_search import Search
+from jaxfx.fit._lens_search import Search, evaluations_per_jacobian
 from jaxfx.lens import ThinLens
 
 
@@ -270,7 +270,10 @@ def dof(
     ratios = read.ratios(ratios)
 
     def fitted_to(model: Model, bar: Bar) -> DofFit:
-        solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
+        every = evaluations_per_jacobian(model)
+        solve = functools.partial(
+            descend, solver=solver, max_steps=max_steps, bar=bar, every=every
+        )
         residual = functools.partial(plain, exposure=is_free, tone=tone)
         return _fitted(*Search(residual, solve, is_robust, max_coc, ratios).run(model))
 

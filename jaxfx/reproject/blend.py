@@ -148,8 +148,8 @@ def _blended(
         total = jnp.zeros((len(pixels), images[0].shape[2]), dtype)
         for k, image in enumerate(images):
             # All sources then have the same kernel: it is not known whose patches it reads.
-            k = jax.lax.optimization_barrier(jnp.int32(k))
-            patch = jax.tree.map(lambda x, k=k: x[k], patches)
+            source = jax.lax.optimization_barrier(jnp.int32(k))
+            patch = jax.tree.map(lambda x, source=source: x[source], patches)
             total = kept(total + patch.sum_colors(image))
         return total, alpha
 

@@ -8,6 +8,7 @@ import optimistix as optx
 from jaxtyping import Array
 
 from jaxfx._progress import Bar
+from jaxfx.fit import _levenberg_marquardt as levenberg_marquardt
 from jaxfx.fit._descent import _begin, _Objective, _step, descend
 from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt
 from tests.helpers.forms import first
@@ -97,3 +98,53 @@ def test_the_last_loss_is_the_mean_square_at_the_unknowns(solver, steps):
         if steps == 40:
             slope, intercept = np.polyfit(x, y, 1)
             np.testing.assert_allclose((a, b), (intercept, slope), rtol=1e-4)
+
+
+def test_corrected_derivatives_lead_to_the_same_minimum(monkeypatch):
+    linearisations, values = [], []
+    linearised = levenberg_marquardt.linearised
+
+    def counted(*data):
+        linearisations.append(data)
+        return linearised(*data)
+
+    monkeypatch.setattr(levenberg_marquardt, "linearised", counted)
+    start = {"a": jnp.asarray(1.0), "b": jnp.asarray(1.0)}
+
+    class Decay(eqx.Module):
+        def __call__(self, unknowns):
+            return decay(unknowns)
+
+        def at(self, unknowns):
+            values.append(float(unknowns["a"]))
+            return decay(unknowns)
+
+    def ended(start):
+        options = {"solver": None, "max_steps": 40, "every": 4}
+        with Bar(False, "fit") as bar:
+            return descend(Decay(), start, bar=bar, **options)
+
+    end = ended(start)
+    np.testing.assert_allclose([end.unknowns[name] for name in "ab"], (3, 2), rtol=1e-4)
+    assert len(linearisations) == -(-(len(end.losses) - 1) // 4) < len(values)
+    # The same steps where the search is one program.
+    inside = jax.jit(ended)(start)
+    np.testing.assert_allclose(
+        inside.losses[0][: len(end.losses) - 1], end.losses[:-1], rtol=1e-6, atol=1e-20
+    )
+
+
+def test_a_step_that_is_not_finite_does_not_spoil_corrected_derivatives():
+    # The logarithm of a negative number, whose derivative is finite and wrong, and a root's,
+    # which is not finite. Steps from 9 are long enough.
+    residual = lambda y, _: (jnp.stack([jnp.log(y["a"]), jnp.sqrt(y["a"]) - 1]), jnp.zeros(()))
+    residual.at = residual
+    solver = LevenbergMarquardt(rtol=1e-9, atol=1e-9, every=2)
+    y = {"a": jnp.asarray(9.0)}
+    state = solver.init(residual, y, None, {}, jnp.zeros(2), jnp.zeros(()), frozenset())
+    tried = []
+    for _ in range(40):
+        tried.append(float(state.tried["a"]))
+        y, state, _ = solver.step(residual, y, None, {}, state, frozenset())
+    assert min(tried) < 0
+    np.testing.assert_allclose(float(y["a"]), 1, rtol=1e-6)
