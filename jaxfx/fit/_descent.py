@@ -188,7 +188,7 @@ class _Objective(eqx.Module):
     `scalar`: for a minimiser, which takes the mean square as its value too.
     """
 
-    residual: Callable[[Any], Float[Array, "..."]]
+    residual: Any
     scalar: bool = eqx.field(static=True)
 
     def __call__(self, unknowns: Any, _: None) -> tuple[Array, Array]:

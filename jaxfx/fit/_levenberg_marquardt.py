@@ -40,8 +40,8 @@ class _State(NamedTuple):
     - `triangle`: R of the QR decomposition of the Jacobian with the residual as its last
       column: all that a step and its promise depend on.
     - `radius`: the inverse of the damping.
-    - `count`: evaluations since that of the last derivatives.
-    - `jacobian`: where it is corrected, else None.
+    - `age`: evaluations since that of the last derivatives.
+    - `jacobian`: residual unknown; None where it is not corrected.
     """
 
     is_first: Bool[Array, ""]
@@ -52,8 +52,8 @@ class _State(NamedTuple):
     radius: Float[Array, ""]
     has_converged: Bool[Array, ""]
     result: optx.RESULTS
-    count: Int[Array, ""]
-    jacobian: Float[Array, "residual unknown"] | None
+    age: Int[Array, ""]
+    jacobian: Any
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -95,10 +95,10 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             jnp.zeros(shape, f_struct.dtype) if self.corrects else None,
         )
 
-    def step(self, fn, y, args, options, state: _State, tags) -> tuple[Any, _State, Any]:
+    def step(self, fn: Any, y, args, options, state: _State, tags) -> tuple[Any, _State, Any]:
         """Evaluate the unknowns that are tried, accept them or not, and choose the next."""
         del options, tags
-        is_due = state.count == 0
+        is_due = state.age == 0
         if self.corrects and is_concrete(state) and not is_due:
             linear = _corrected(y, state, *fn.at(state.tried, args))
         else:
@@ -212,7 +212,7 @@ def _after(
         radius,
         has_converged,
         result,
-        (state.count + 1) % solver.every,
+        (state.age + 1) % solver.every,
         jacobian if solver.corrects else None,
     )
     # What is reported belongs to the unknowns before the step.

@@ -183,7 +183,8 @@ def traverse(
     thickness = jnp.max(jnp.where(is_finite, height_field, -jnp.inf)) - nearest
 
     def hits(rays):
-        r = grid_rays(*rays, origin_at_end)
+        origin, direction = rays
+        r = grid_rays(origin, direction, origin_at_end)
         states = _first_states(pyramid, thickness, r)
         return _texel_hits(pyramid, r, *_step_packed(pyramid, r, *states, limit))
 
@@ -298,8 +299,8 @@ def _all_hits(pyramid, thickness, rays, max_steps, origin_at_end) -> TexelHit:
 
         XLA else keeps the reciprocals through the loop, or joins a step with the next.
         """
-        rays, *states = jax.lax.optimization_barrier((rays, *states))
-        return grid_rays_of(*rays, origin_at_end), *states
+        (origin, direction), *states = jax.lax.optimization_barrier((rays, *states))
+        return grid_rays_of(origin, direction, origin_at_end), *states
 
     def is_unfinished(state, steps):
         if max_steps == np.iinfo(np.int32).max:
