@@ -208,7 +208,7 @@ def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Lin
 
 
 @functools.cache
-def _default_solver(every: int) -> LevenbergMarquardt:
+def _default_solver(every: int = 1) -> LevenbergMarquardt:
     return LevenbergMarquardt(rtol=1e-4, atol=1e-5, every=every)
 
 

@@ -194,7 +194,9 @@ def dof(
     - `tone`: `"linear"`, or `"log"` for what is far above the reference's mean.
     - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
-      Levenberg-Marquardt, which has also converged where its steps gain next to nothing.
+      Levenberg-Marquardt, which has also converged where its steps gain next to nothing. With
+      a side of more than 160 pixels it computes derivatives once in eight evaluations, and
+      corrects them by what the others show (Broyden 1965).
     - `parameters`: the names to fit. By default those of the effect, `fit.PARAMETERS`
       (aperture, focus_distance, gamma, epsilon) or `fit.LAYERED_PARAMETERS` (aperture,
       focus_distance, threshold). With either also `fit.DISPARITY_PARAMETERS`, scale and shift:
