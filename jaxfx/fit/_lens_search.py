@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,9 +53,10 @@ _HANDICAP = 1.01
 _SOON = {"patience": 2, "gain": 1e-3}
 # When the last search has: each more step costs as much as all of a small image's.
 _LAST = {"patience": 3}
-# Evaluations to one with derivatives, which costs eight times as much. Smaller numbers cost
-# time, larger ones end farther from the minimum.
-_EVERY = 8
+# Evaluations to one with derivatives, on images with a side of more than `_COARSE` pixels:
+# there derivatives are most of what a fit costs. With more a search ends farther from the
+# minimum; on small images, which decide what minimum it is, each evaluation has them.
+_EVERY = 4
 
 
 class Search(NamedTuple):
@@ -114,7 +115,12 @@ class Search(NamedTuple):
         """A search whose end is another's start, at the noise of its own start."""
         if self.is_robust:
             residual = weighed(residual, unknowns, has_edges)
-        return self.solve(residual, unknowns, **_SOON)
+        return self._solve(residual, unknowns, **_SOON)
+
+    def _solve(self, residual: Residual, unknowns: Values, **when: Any) -> End:
+        """A search that has converged `when` `descend` is to say so."""
+        is_large = max(residual.model.images.depth.shape) > _COARSE
+        return self.solve(residual, unknowns, every=_EVERY if is_large else 1, **when)
 
     def _beside_edges(self, residual: Residual, unknowns: Values) -> list[End]:
         """Two searches in which edges have a noise of their own, the better one first.
@@ -150,7 +156,7 @@ class Search(NamedTuple):
                 end = self._refine(residual, unknowns, has_edges=True)
                 unknowns, losses = end.unknowns, losses + end.losses
                 residual = weighed(residual, unknowns, True)
-            end = self.solve(residual, unknowns, **_LAST)
+            end = self._solve(residual, unknowns, **_LAST)
             unknowns, losses = end.unknowns, losses + end.losses
             circles = model.circles(model.values(unknowns))
             is_bounded = self.max_coc is not None
@@ -207,15 +213,6 @@ class Search(NamedTuple):
                 start[name] = origin[name] + (values if origin[name].ndim else values[0])
             starts.append(start)
         return starts
-
-
-def evaluations_per_jacobian(model: Model) -> int:
-    """How many evaluations a search makes to one with derivatives.
-
-    Where searches begin on the images as given, each has derivatives: they cost little there,
-    and a search with fewer may end in another minimum.
-    """
-    return _EVERY if max(model.images.depth.shape) > _COARSE else 1
 
 
 def _origin(model: Model, ratios: tuple[str, ...]) -> Values:

@@ -24,7 +24,7 @@ from jaxfx.fit._jackknife import covariance, tiles
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Model, Values
 from jaxfx.fit._lens_noise import defocus
 from jaxfx.fit._lens_residual import Report, Residual, Tone, plain, report
-from jaxfx.fit._lens_search import Search, evaluations_per_jacobian
+from jaxfx.fit._lens_search import Search
 from jaxfx.lens import ThinLens
 
 
@@ -194,9 +194,9 @@ def dof(
     - `tone`: `"linear"`, or `"log"` for what is far above the reference's mean.
     - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
-      Levenberg-Marquardt, which has also converged where its steps gain next to nothing. With
-      a side of more than 160 pixels it computes derivatives once in eight evaluations, and
-      corrects them by what the others show (Broyden 1965).
+      Levenberg-Marquardt, which has also converged where its steps gain next to nothing. On
+      images with a side of more than 160 pixels it computes derivatives once in four
+      evaluations, and corrects them by what the others show (Broyden 1965).
     - `parameters`: the names to fit. By default those of the effect, `fit.PARAMETERS`
       (aperture, focus_distance, gamma, epsilon) or `fit.LAYERED_PARAMETERS` (aperture,
       focus_distance, threshold). With either also `fit.DISPARITY_PARAMETERS`, scale and shift:
@@ -272,10 +272,7 @@ def dof(
     ratios = read.ratios(ratios)
 
     def fitted_to(model: Model, bar: Bar) -> DofFit:
-        every = evaluations_per_jacobian(model)
-        solve = functools.partial(
-            descend, solver=solver, max_steps=max_steps, bar=bar, every=every
-        )
+        solve = functools.partial(descend, solver=solver, max_steps=max_steps, bar=bar)
         residual = functools.partial(plain, exposure=is_free, tone=tone)
         return _fitted(*Search(residual, solve, is_robust, max_coc, ratios).run(model))
 
