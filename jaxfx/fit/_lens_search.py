@@ -118,7 +118,7 @@ class Search(NamedTuple):
         return self._solve(residual, unknowns, **_SOON)
 
     def _solve(self, residual: Residual, unknowns: Values, **when: Any) -> End:
-        """A search that has converged `when` `descend` is to say so."""
+        """`solve`, with derivatives at each evaluation or, on large images, at some."""
         is_large = max(residual.model.images.depth.shape) > _COARSE
         return self.solve(residual, unknowns, every=_EVERY if is_large else 1, **when)
 
