@@ -70,5 +70,6 @@ def _pyramid(values: Array, combine: Callable, identity: float) -> Pyramid:
         padded = jax.lax.pad(finer, jnp.asarray(identity, finer.dtype), padding)
         rows = combine(padded[::2], padded[1::2])
         level = combine(rows[:, ::2], rows[:, 1::2])
+        # Every second one in memory: an accelerator else computes each from all finer ones.
         levels.append(kept(level) if len(levels) % 2 == 0 else level)
     return Pyramid(jnp.concatenate([level.reshape(-1) for level in levels]), shapes)
