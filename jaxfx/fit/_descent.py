@@ -197,7 +197,7 @@ class _Objective(eqx.Module):
         return (loss if self.scalar else residual), loss
 
     def at(self, unknowns: Any, _: None) -> tuple[Array, Array]:
-        """What a call gives, by the residual's own program `at`."""
+        """The same residual and loss as a call, without derivatives: by `residual.at`."""
         residual = self.residual.at(unknowns)
         return residual, jnp.mean(residual * residual)
 

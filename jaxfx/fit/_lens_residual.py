@@ -83,7 +83,10 @@ class Residual(eqx.Module):
         return self.weighted(self.compare(unknowns).difference)
 
     def at(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
-        """What a call gives, by the program that the report runs."""
+        """The same residual as a call, by the compiled program of `evaluate`.
+
+        A search takes it where it needs no derivative: no other program is compiled for it.
+        """
         return _weighted(self, evaluate(self, unknowns).difference)
 
 

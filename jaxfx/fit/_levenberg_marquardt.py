@@ -151,7 +151,12 @@ def linearised(fn: Callable[[Any, Any], tuple[Array, Any]], y: Any, args: Any) -
 
 @eqx.filter_jit
 def _corrected(y: Any, state: _State, residual: Array, aux: Any) -> Linear:
-    """What was evaluated at `state.tried`, and the Jacobian that tells it from `y`."""
+    """The residual at `state.tried` with a Jacobian that is corrected, not computed.
+
+    Broyden's correction is the least change of the Jacobian after which the step from `y`
+    to `state.tried` changes the residual by as much as was evaluated. A step of length 0, or
+    to a residual that is not finite, corrects nothing.
+    """
     moved = ravel_pytree(state.tried)[0] - ravel_pytree(y)[0]
     residual = residual.reshape(-1)
     missed = residual - state.residual - state.jacobian @ moved
