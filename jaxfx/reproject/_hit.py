@@ -93,8 +93,9 @@ class Patch(NamedTuple):
                 total, _ = add(total, texel)
             return total
 
-        total = jnp.zeros((self.weights.shape[1], image.shape[2]), image.dtype)
-        return by_platform(total, self.weights, cpu=in_turn, accelerator=at_once)
+        weights = self.weights.astype(image.dtype)
+        total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
+        return by_platform(total, weights, cpu=in_turn, accelerator=at_once)
 
 
 def _texel(

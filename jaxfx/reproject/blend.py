@@ -150,7 +150,7 @@ def _blended(
             # All sources then have the same kernel: it is not known whose patches it reads.
             source = jax.lax.optimization_barrier(jnp.int32(k))
             patch = jax.tree.map(lambda x, source=source: x[source], patches)
-            total = kept(total + patch.sum_colors(image))
+            total = kept(total + patch.sum_colors(image).astype(dtype))
         return total, alpha
 
     def in_parts(pixels: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from benchmarks.scenes.reproject import run
 from jaxfx import PinholeCamera, reproject
 from tests.cases.reproject import awkward_rays, field
 from tests.reproject.test_blend import (  # noqa: F401
+    test_images_of_two_types_give_the_first_ones,
     test_the_choice_is_what_shows_most_and_then_what_it_lacks,
     test_the_nearer_surface_hides_the_farther,
     test_two_sources_fill_each_others_gaps,

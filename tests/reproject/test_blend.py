@@ -50,6 +50,16 @@ def test_one_source_is_a_warp():
     np.testing.assert_array_equal(alpha, mask)
 
 
+@pytest.mark.parametrize("first", [np.float32, np.float64])
+def test_images_of_two_types_give_the_first_ones(first):
+    eye, depth = camera(), np.full((16, 24), 2.0)
+    other = np.float64 if first == np.float32 else np.float32
+    images = [np.full((16, 24, 3), value, kind) for value, kind in ((1, first), (3, other))]
+    drawn, alpha = blend(images, [depth] * 2, [eye] * 2, eye)
+    assert drawn.dtype == alpha.dtype == first
+    np.testing.assert_allclose(drawn, 2, rtol=1e-6)
+
+
 def test_the_nearer_surface_hides_the_farther():
     eye = camera()
     near, far = np.full((16, 24), 2.0), np.full((16, 24), 5.0)
