@@ -9,13 +9,16 @@ coordinate z that grows away from the viewer. In `warp` it is the inverse depth 
 camera, in `intersect` the depth itself.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int8, Int16
 
+
+# x, y and z of points or directions, each an array over rays. One array of three columns would
+# be kept in two orders by XLA for a GPU, and cost it instructions that only take columns out.
+Coordinates = tuple[Float[Array, " ray"], Float[Array, " ray"], Float[Array, " ray"]]
 
 # The face through which a ray meets a texel's column: its top, a side at a border in x or in y,
 # or none, because the ray starts inside the column. `_hit` uses them as indices.
@@ -83,22 +86,15 @@ class EntryTexel(NamedTuple):
     inside: Bool[Array, " ray"]
 
 
+def coordinates(points: Float[Array, "ray 3"]) -> Coordinates:
+    """x, y and z of points or directions."""
+    return points[:, 0], points[:, 1], points[:, 2]
+
+
 def grid_rays(
-    origin: Float[Array, "ray 3"], direction: Float[Array, "ray 3"], origin_at_end: bool = False
+    origin: Coordinates, direction: Coordinates, origin_at_end: bool = False
 ) -> GridRays:
-    """Rays by coordinate. Where x or y is constant, it is moved to the middle of its texels."""
-    return grid_rays_of(coordinates(origin), coordinates(direction), origin_at_end)
-
-
-def coordinates(points: Float[Array, "ray 3"]) -> list[Float[Array, " ray"]]:
-    """x, y and z of points or directions, each an array over rays."""
-    return [points[:, k] for k in range(3)]
-
-
-def grid_rays_of(
-    origin: Sequence[Array], direction: Sequence[Array], origin_at_end: bool
-) -> GridRays:
-    """`grid_rays` of origins and directions that are given by coordinate."""
+    """Rays with their reciprocals. A constant x or y is moved to the middle of its texels."""
     dx, dy, dz = (jnp.where(d == 0, 0, d) for d in direction)
     ox, oy, oz = origin
     ox = jnp.where(dx == 0, jnp.floor(ox) + 0.5, ox)

@@ -14,12 +14,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._loops import fori_loop, scan
 from jaxfx._numerics import safe_divide
 from jaxfx._platform import by_platform, kept
-from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, not_before_start
+from jaxfx.reproject._crossings import (
+    TOP,
+    X_SIDE,
+    Y_SIDE,
+    Coordinates,
+    TexelHit,
+    not_before_start,
+)
 
 
 # Newton steps on a patch. With fewer, more rays do not converge, and so keep the point of the
@@ -56,8 +64,8 @@ class Patch(NamedTuple):
     def read(self, values: Float[Array, "height width"]) -> Float[Array, " ray"]:
         """The weighted mean of a map; 0 where all weights are 0."""
         total = jnp.zeros_like(self.weights[0])
-        for corner, weight in zip(_CORNERS, self.weights, strict=True):
-            texel = _texel(values, self.row, self.column, corner)
+        for (down, right), weight in zip(_CORNERS, self.weights, strict=True):
+            texel = _texels(values, self.row + down, self.column + right)
             total = total + weight * _unless_unusable(texel, weight)
         return safe_divide(total, jnp.sum(self.weights, axis=0))
 
@@ -80,8 +88,8 @@ class Patch(NamedTuple):
         """
 
         def add(total: Array, texel: Any) -> tuple[Array, None]:
-            corner, weight = texel
-            color = _texel(image, self.row, self.column, corner)
+            (down, right), weight = texel
+            color = _texels(image, self.row + down, self.column + right)
             weight = jnp.broadcast_to(weight[:, None], color.shape)
             return total + weight * _unless_unusable(color, weight), None
 
@@ -89,25 +97,24 @@ class Patch(NamedTuple):
             return scan(add, total, (jnp.asarray(_CORNERS, jnp.int32), weights))[0]
 
         def at_once(total: Array, weights: Array) -> Array:
-            for texel in zip(_CORNERS, weights, strict=True):
-                total, _ = add(total, texel)
-            return total
+            down, right = np.asarray(_CORNERS, np.int32).T[..., None]
+            colors = _texels(image, self.row[None] + down, self.column[None] + right)
+            weights = jnp.broadcast_to(weights[..., None], colors.shape)
+            return total + jnp.sum(weights * _unless_unusable(colors, weights), axis=0)
 
         weights = self.weights.astype(image.dtype)
         total = jnp.zeros((weights.shape[1], image.shape[2]), image.dtype)
         return by_platform(total, weights, cpu=in_turn, accelerator=at_once)
 
 
-def _texel(
+def _texels(
     values: Float[Array, "height width *channel"],
-    row: Int[Array, " ray"],
-    column: Int[Array, " ray"],
-    corner: tuple[int, int] | Int[Array, "2"],
-) -> Float[Array, "ray *channel"]:
-    """The texel of each stencil in one of its corners."""
-    down, right = corner
+    row: Int[Array, "..."],
+    column: Int[Array, "..."],
+) -> Float[Array, "..."]:
+    """The texels in these rows and columns, or the nearest ones inside the map."""
     height, width = values.shape[:2]
-    place = jnp.clip(row + down, 0, height - 1), jnp.clip(column + right, 0, width - 1)
+    place = jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)
     return values.at[place].get(mode="promise_in_bounds")
 
 
@@ -136,7 +143,7 @@ def edge_aware_patch(
     row = jnp.clip(corner_y, -1, height - 1).astype(jnp.int32)
     weights = []
     for down, right in _CORNERS:
-        value = jax.lax.stop_gradient(_texel(height_field, row, column, (down, right)))
+        value = jax.lax.stop_gradient(_texels(height_field, row + down, column + right))
         is_on_surface = value < jnp.inf
         if threshold is not None:
             is_on_surface = is_on_surface & ~is_depth_step(value, anchor, threshold)
@@ -164,12 +171,12 @@ class SurfacePoint(NamedTuple):
       it grazes the patch or Newton's method did not converge.
     """
 
-    position: Float[Array, "ray 3"]
+    position: Coordinates
     grazing: Bool[Array, " ray"]
 
 
 def texel_point(
-    height_field: Array, origin: Array, direction: Array, hit: TexelHit
+    height_field: Array, origin: Coordinates, direction: Coordinates, hit: TexelHit
 ) -> SurfacePoint:
     """The point where rays meet the top or a side of a texel's column.
 
@@ -183,7 +190,7 @@ def texel_point(
 
 
 def _texel_miss(
-    height_field: Array, origin: Array, direction: Array, hit: TexelHit
+    height_field: Array, origin: Coordinates, direction: Coordinates, hit: TexelHit
 ) -> tuple[Float[Array, " ray"], Float[Array, " ray"]]:
     """The function that is 0 at the hit of a top or side, and its derivative along the ray.
 
@@ -191,7 +198,7 @@ def _texel_miss(
     a ray that starts inside the column it is 0: the time does not depend on anything.
     """
     x, y, z = _point_on(origin, direction, hit.time)
-    dx, dy, dz = (jax.lax.stop_gradient(direction[:, k]) for k in range(3))
+    dx, dy, dz = jax.lax.stop_gradient(direction)
     top = hit.read(height_field)
     zeros = [jnp.zeros_like(x)] * 4
     miss, slope = list(zeros), [jnp.ones_like(x)] * 4
@@ -207,8 +214,8 @@ def _texel_miss(
 
 def patch_point(
     height_field: Array,
-    origin: Array,
-    direction: Array,
+    origin: Coordinates,
+    direction: Coordinates,
     hit: TexelHit,
     threshold: int | float | None,
     *,
@@ -220,13 +227,11 @@ def patch_point(
     grazes the patch, the point and its derivative are those of the texel.
     """
     hold = jax.lax.stop_gradient
-    # By coordinate: what a loop reads is kept as it is.
-    origins, directions = ([x[:, k] for k in range(3)] for x in (origin, direction))
-    held_field, o, d = hold(height_field), hold(origins), hold(directions)
+    held_field, o, d = hold((height_field, origin, direction))
     anchor = hit.read(held_field)
 
     def patch_miss(height_field, origin, direction, time):
-        x, y, z = (o + time * d for o, d in zip(origin, direction, strict=True))
+        x, y, z = _point_on(origin, direction, time)
         return z - edge_aware_patch(held_field, x, y, anchor, threshold).read(height_field)
 
     value_and_slope = lambda time: jax.jvp(
@@ -260,7 +265,7 @@ def patch_point(
     is_on_patch = (slope > _MIN_SLOPE * terms) & hit.mask
     time = jnp.where(is_on_patch, time, hit.time)
     texel_miss, texel_slope = _texel_miss(height_field, origin, direction, hit)
-    miss = patch_miss(height_field, origins, directions, time)
+    miss = patch_miss(height_field, origin, direction, time)
     miss = jnp.where(is_on_patch, miss, texel_miss)
     slope = jnp.where(is_on_patch, slope, texel_slope)
     is_differentiable, grazing = hit.mask & (slope != 0), hit.mask & ~is_on_patch
@@ -276,12 +281,13 @@ def _implicit_point(
     """
     miss = jnp.where(is_differentiable, miss, 0)
     time = _implicit_root(time, miss, jnp.where(is_differentiable, slope, 1))
-    return SurfacePoint(jnp.stack(_point_on(origin, direction, time), axis=-1), grazing)
+    return SurfacePoint(_point_on(origin, direction, time), grazing)
 
 
-def _point_on(origin: Array, direction: Array, time: Array) -> list[Float[Array, " ray"]]:
+def _point_on(origin: Coordinates, direction: Coordinates, time: Array) -> Coordinates:
     """x, y and z of rays at a time."""
-    return [origin[:, k] + time * direction[:, k] for k in range(3)]
+    x, y, z = (o + time * d for o, d in zip(origin, direction, strict=True))
+    return x, y, z
 
 
 @jax.custom_jvp

@@ -21,10 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import inverse
 from jaxfx.camera import Camera, PinholeCamera
-
-
-# Three coordinates, each an array over rays.
-_Point = tuple[Array, Array, Array]
+from jaxfx.reproject._crossings import Coordinates
 
 
 class ViewRays(NamedTuple):
@@ -35,8 +32,8 @@ class ViewRays(NamedTuple):
     - `inside`: whether any of the ray is in the frustum; where not, both are 0.
     """
 
-    origin: Float[Array, "ray 3"]
-    direction: Float[Array, "ray 3"]
+    origin: Coordinates
+    direction: Coordinates
     inside: Bool[Array, " ray"]
 
 
@@ -55,23 +52,21 @@ def view_rays(
     length = _length(vanishing, eye, begin, end)
     # Outside the frustum all factors are finite: the derivative, 0 times them, is then 0.
     is_ray = (begin < end) & jnp.isfinite(length)
-    # By coordinate up to here: else XLA for a GPU would keep each ray in two orders.
     direction = [x * jnp.where(is_ray, length, 0) for x in _direction(vanishing, eye)]
     runs_away = jax.lax.stop_gradient(direction[2]) > 0
     origin_depth = jnp.where(is_ray, jnp.where(runs_away, end, begin), 1)
     origin = _point_at(vanishing, eye, origin_depth)
     sums = map(jnp.add, origin, direction)
     inside = ft.reduce(jnp.logical_and, map(jnp.isfinite, sums), is_ray)
-    origin, direction = (
-        jnp.stack([jnp.where(inside, x, 0) for x in planes], axis=-1)
-        for planes in (origin, direction)
+    origin, direction = jax.tree.map(
+        lambda x: jnp.where(inside, x, 0), (origin, tuple(direction))
     )
     return ViewRays(origin, direction, inside)
 
 
 def _homogeneous_lines(
     camera: PinholeCamera, target: Camera, pixels: Array, unit: Array
-) -> tuple[_Point, _Point]:
+) -> tuple[Coordinates, Coordinates]:
     """m and b of the module's docstring, per ray: the target's depth is multiplied by m."""
     dtype = pixels.dtype
     intrinsics, camera_from_world = (
@@ -108,7 +103,9 @@ def _homogeneous_lines(
     return (m_x, m_y, m_z), (b_x, b_y, b_z)
 
 
-def _clip(vanishing: _Point, eye: _Point, height: int, width: int) -> tuple[Array, Array]:
+def _clip(
+    vanishing: Coordinates, eye: Coordinates, height: int, width: int
+) -> tuple[Array, Array]:
     """The target depths between which lines are in the frustum. Held constant.
 
     For each plane of the frustum a point is inside where `growth` * depth + `at_eye` >= 0.
@@ -132,13 +129,15 @@ def _clip(vanishing: _Point, eye: _Point, height: int, width: int) -> tuple[Arra
     return begin, end
 
 
-def _direction(vanishing: _Point, eye: _Point) -> _Point:
+def _direction(vanishing: Coordinates, eye: Coordinates) -> Coordinates:
     """The direction in (x, y, -1/z) in which points move with growing target depth."""
     (x, y, z), (eye_x, eye_y, eye_z) = vanishing, eye
     return x * eye_z - eye_x * z, y * eye_z - eye_y * z, z
 
 
-def _length(vanishing: _Point, eye: _Point, begin: Array, end: Array) -> Float[Array, " ray"]:
+def _length(
+    vanishing: Coordinates, eye: Coordinates, begin: Array, end: Array
+) -> Float[Array, " ray"]:
     """The multiple of `_direction` between two target depths. Held constant."""
     hold = jax.lax.stop_gradient
     z, eye_z = hold(vanishing[2]), hold(eye[2])
@@ -147,7 +146,7 @@ def _length(vanishing: _Point, eye: _Point, begin: Array, end: Array) -> Float[A
     return (1 - begin * inverse_end) / (jnp.maximum(z_begin, 1) * z_end)
 
 
-def _point_at(vanishing: _Point, eye: _Point, target_depth: Array) -> _Point:
+def _point_at(vanishing: Coordinates, eye: Coordinates, target_depth: Array) -> Coordinates:
     """(x, y, -1/z) at a depth of the target, which may be 0 or infinite."""
     is_eye = target_depth == 0
     reciprocal = 1 / jnp.where(is_eye, 1, target_depth)

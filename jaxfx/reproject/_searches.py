@@ -23,6 +23,7 @@ from jaxfx._pyramid import Pyramid, minimum_pyramid
 from jaxfx.reproject._crossings import (
     START,
     TOP,
+    Coordinates,
     EntryTexel,
     GridRays,
     TexelHit,
@@ -47,8 +48,8 @@ _BISECTIONS = 8
 
 def first_crossing(
     height_field: Float[Array, "height width"],
-    origin: Float[Array, "ray 3"],
-    direction: Float[Array, "ray 3"],
+    origin: Coordinates,
+    direction: Coordinates,
     search: str,
     max_steps: int | None,
     *,
@@ -60,7 +61,7 @@ def first_crossing(
     `origin_at_end` means. The time of a miss is set to 0: a derivative multiplies it by 0, and
     an infinite time would make that NaN. Under `vmap` the cost is that of all rays together.
     """
-    held = map(jax.lax.stop_gradient, (height_field, origin, direction))
+    held = map(jax.lax.stop_gradient, (height_field, *origin, *direction))
     hit = _batchable(search, max_steps, origin_at_end)(*held)
     return hit._replace(time=jnp.where(hit.mask, hit.time, 0))
 
@@ -69,8 +70,8 @@ def first_crossing(
 def _batchable(search: str, max_steps: int | None, origin_at_end: bool):
     function = _SEARCHES[search]
 
-    def single(height_field, origin, direction):
-        return function(height_field, origin, direction, max_steps, origin_at_end)
+    def single(height_field, *rays):
+        return function(height_field, rays[:3], rays[3:], max_steps, origin_at_end)
 
     return _of_batches(single, ())
 
@@ -78,8 +79,9 @@ def _batchable(search: str, max_steps: int | None, origin_at_end: bool):
 def _of_batches(search, levels: tuple[list[bool], ...]):
     """A search with a rule for `vmap`: rays of a batch on one height field are concatenated.
 
-    `levels` are those of `of_batches`. On a CPU, batches of height fields go one by one: a loop
-    under `vmap` would run every search as long as the longest.
+    The rays are six arrays, the coordinates of origins and directions. `levels` are those of
+    `of_batches`. On a CPU, batches of height fields go one by one: a loop under `vmap` would
+    run every search as long as the longest.
     """
     batchable = custom_vmap(each_device(search, levels) if levels else search)
 
@@ -89,7 +91,7 @@ def _of_batches(search, levels: tuple[list[bool], ...]):
             ray if has_axis else jnp.broadcast_to(ray, (size, *ray.shape))
             for ray, has_axis in zip(rays, is_batched[1:], strict=True)
         ]
-        is_batched = [is_batched[0], True, True]
+        is_batched = [is_batched[0], *[True] * len(rays)]
         more = is_batched, *levels
         if is_batched[0]:
             in_turn = lambda *data: jax.lax.map(lambda items: search(*items), data)
@@ -105,7 +107,7 @@ def _concatenated(search):
     """A search for a batch of rays, of all members together."""
 
     def together(height_field, *rays):
-        merged = [ray.reshape(-1, *ray.shape[2:]) for ray in rays]
+        merged = [ray.reshape(-1) for ray in rays]
         found = search(height_field, *merged)
         return jax.tree.map(lambda x: x.reshape(*rays[0].shape[:2], *x.shape[1:]), found)
 
@@ -114,8 +116,8 @@ def _concatenated(search):
 
 def descend(
     height_field: Float[Array, "height width"],
-    origin: Float[Array, "ray 3"],
-    direction: Float[Array, "ray 3"],
+    origin: Coordinates,
+    direction: Coordinates,
     max_steps: int | None,
     origin_at_end: bool,
 ) -> TexelHit:
@@ -147,8 +149,8 @@ def descend(
 
 def linear(
     height_field: Float[Array, "height width"],
-    origin: Float[Array, "ray 3"],
-    direction: Float[Array, "ray 3"],
+    origin: Coordinates,
+    direction: Coordinates,
     max_steps: int | None,
     origin_at_end: bool,
 ) -> TexelHit:
@@ -165,8 +167,8 @@ def linear(
 
 def relief(
     height_field: Float[Array, "height width"],
-    origin: Float[Array, "ray 3"],
-    direction: Float[Array, "ray 3"],
+    origin: Coordinates,
+    direction: Coordinates,
     max_steps: int | None,
     origin_at_end: bool,
 ) -> TexelHit:
@@ -190,7 +192,7 @@ _SEARCHES = {"pyramid": traverse, "descent": descend, "linear": linear, "relief"
 
 
 def _rays_and_entry(
-    height_field: Array, origin: Array, direction: Array, origin_at_end: bool
+    height_field: Array, origin: Coordinates, direction: Coordinates, origin_at_end: bool
 ) -> tuple[GridRays, EntryTexel]:
     r = grid_rays(origin, direction, origin_at_end)
     return r, entry_texel(r, *height_field.shape)

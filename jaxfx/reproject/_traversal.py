@@ -32,17 +32,16 @@ from jaxfx.reproject._crossings import (
     TOP,
     X_SIDE,
     Y_SIDE,
+    Coordinates,
     GridRays,
     Moment,
     TexelHit,
     axis_entries,
     backward_axes,
-    coordinates,
     crossing_moment,
     earlier,
     entry_texel,
     grid_rays,
-    grid_rays_of,
     is_earlier,
     start_time,
     texel_at,
@@ -170,8 +169,8 @@ def _clip_to_cell(
 
 def traverse(
     height_field: Float[Array, "height width"],
-    origin: Float[Array, "ray 3"],
-    direction: Float[Array, "ray 3"],
+    origin: Coordinates,
+    direction: Coordinates,
     max_steps: int | None,
     origin_at_end: bool,
 ) -> TexelHit:
@@ -189,18 +188,17 @@ def traverse(
         return _texel_hits(pyramid, r, *_step_packed(pyramid, r, *states, limit))
 
     def in_batches(*rays):
-        count = len(origin)
+        count = len(origin[0])
         batches = -(-count // _BATCH_RAYS)
         if batches <= 1:
             return hits(rays)
         size = _whole_lanes(count / batches)
-        padding = ((0, batches * size - count), (0, 0))
-        split = tuple(jnp.pad(x, padding).reshape(batches, size, 3) for x in rays)
+        padding = (0, batches * size - count)
+        split = jax.tree.map(lambda x: jnp.pad(x, padding).reshape(batches, size), rays)
         texel_hits = jax.lax.map(hits, split)
         return jax.tree.map(lambda x: x.reshape(-1)[:count], texel_hits)
 
     def all_at_once(*rays):
-        rays = [coordinates(x) for x in rays]
         return _all_hits(pyramid, thickness, rays, limit, origin_at_end)
 
     return by_platform(origin, direction, cpu=in_batches, accelerator=all_at_once)
@@ -287,8 +285,8 @@ def _step_packed(pyramid, r, state, steps, max_steps):
 def _all_hits(pyramid, thickness, rays, max_steps, origin_at_end) -> TexelHit:
     """The hits on an accelerator: all rays step to the end.
 
-    - `rays`: origins and directions by coordinate. What a step needs beside them it computes
-      again, which takes less time than to read it.
+    - `rays`: origins and directions. What a step needs beside them it computes again, which
+      takes less time than to read it.
 
     Where nothing bounds the steps the loop does not read their counts: XLA then leaves out
     those that nobody asks for, and keeps one state per ray instead of seven.
@@ -300,7 +298,7 @@ def _all_hits(pyramid, thickness, rays, max_steps, origin_at_end) -> TexelHit:
         XLA else keeps the reciprocals through the loop, or joins a step with the next.
         """
         (origin, direction), *states = jax.lax.optimization_barrier((rays, *states))
-        return grid_rays_of(origin, direction, origin_at_end), *states
+        return grid_rays(origin, direction, origin_at_end), *states
 
     def is_unfinished(state, steps):
         if max_steps == np.iinfo(np.int32).max:

@@ -10,6 +10,7 @@ from jaxfx._arrays import ArrayLike
 from jaxfx._checks import WholeNumber, option, parameter, whole_number
 from jaxfx._meshes import on_any_mesh
 from jaxfx._numerics import working_dtype
+from jaxfx.reproject._crossings import coordinates
 from jaxfx.reproject._hit import patch_point, texel_point
 from jaxfx.reproject._searches import first_crossing
 from jaxfx.reproject._traversal import LARGEST_SIDE
@@ -115,15 +116,15 @@ def _intersect(depth, origin, direction, search, max_steps, surface) -> Hit:
     """`intersect` of checked arguments. The height field of the search is the depth itself."""
     height_field = jnp.where(depth > 0, depth, jnp.inf)
     batch = origin.shape[:-1]
-    flat_origin, flat_direction = (x.reshape(-1, 3) for x in (origin, direction))
+    flat_origin, flat_direction = (coordinates(x.reshape(-1, 3)) for x in (origin, direction))
     hit = first_crossing(height_field, flat_origin, flat_direction, search, max_steps)
     if surface == "texel":
         point = texel_point(height_field, flat_origin, flat_direction, hit)
     else:
         point = patch_point(height_field, flat_origin, flat_direction, hit, None)
-    position = jnp.where(hit.mask[:, None], point.position, flat_origin)
+    position = jnp.stack(point.position, axis=-1).reshape(*batch, 3)
     return Hit(
-        position.reshape(*batch, 3),
+        jnp.where(hit.mask.reshape(*batch, 1), position, origin),
         *(x.reshape(batch) for x in (hit.mask, hit.steps, hit.exhausted, point.grazing)),
     )
 

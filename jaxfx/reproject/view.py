@@ -20,7 +20,14 @@ from jaxfx._numerics import normalize
 from jaxfx._platform import kept
 from jaxfx.camera import Camera, PinholeCamera
 from jaxfx.camera.rigid import per_depth
-from jaxfx.reproject._crossings import TOP, X_SIDE, Y_SIDE, TexelHit, start_time
+from jaxfx.reproject._crossings import (
+    TOP,
+    X_SIDE,
+    Y_SIDE,
+    Coordinates,
+    TexelHit,
+    start_time,
+)
 from jaxfx.reproject._hit import Patch, edge_aware_patch, is_depth_step, patch_point
 from jaxfx.reproject._rays import view_rays
 from jaxfx.reproject._searches import first_crossing
@@ -76,13 +83,13 @@ def trace_pixels(
 
     ray = rays.origin, rays.direction
     # A ray that ends at infinity may meet a surface there, but nothing beyond it.
-    is_in_front = hold(ray[0][:, 2] + hit.time * ray[1][:, 2]) <= 0
+    is_in_front = hold(rays.origin[2] + hit.time * rays.direction[2]) <= 0
     hit = hit._replace(mask=hit.mask & rays.inside & is_in_front)
     is_behind_gap = _comes_through_gap(hold(inverse_depth), *hold(ray), hit, hole_threshold)
     is_behind_gap, time = kept((is_behind_gap, hit.time))
     hit = hit._replace(time=time)
     point = patch_point(inverse_depth, *ray, hit, hole_threshold, origin_at_end=True)
-    x, y, z = kept([point.position[:, k] for k in range(3)])
+    x, y, z = kept(point.position)
     column, row = (
         jnp.clip(jnp.floor(v), 0, size - 1).astype(jnp.int32)
         for v, size in ((x, width), (y, height))
@@ -96,7 +103,11 @@ def trace_pixels(
 
 
 def _comes_through_gap(
-    inverse_depth: Array, origin: Array, direction: Array, hit: TexelHit, threshold: int | float
+    inverse_depth: Array,
+    origin: Coordinates,
+    direction: Coordinates,
+    hit: TexelHit,
+    threshold: int | float,
 ) -> Bool[Array, " ray"]:
     """Whether a ray met its texel through a gap between surfaces, which the camera did not see.
 
@@ -105,22 +116,22 @@ def _comes_through_gap(
     a surface that is not in the image.
     """
     height, width = inverse_depth.shape
-    back_x = jnp.where(hit.face == X_SIDE, -jnp.sign(direction[:, 0]), 0).astype(jnp.int32)
-    back_y = jnp.where(hit.face == Y_SIDE, -jnp.sign(direction[:, 1]), 0).astype(jnp.int32)
+    back_x = jnp.where(hit.face == X_SIDE, -jnp.sign(direction[0]), 0).astype(jnp.int32)
+    back_y = jnp.where(hit.face == Y_SIDE, -jnp.sign(direction[1]), 0).astype(jnp.int32)
     x, y = hit.x.astype(jnp.int32) + back_x, hit.y.astype(jnp.int32) + back_y
     float_type = jnp.finfo(inverse_depth.dtype)
-    speed = jnp.maximum(jnp.abs(direction[:, 0]), jnp.abs(direction[:, 1]))
-    texels_passed = (hit.time - start_time(direction[:, 2], origin_at_end=True)) * speed
+    speed = jnp.maximum(jnp.abs(direction[0]), jnp.abs(direction[1]))
+    texels_passed = (hit.time - start_time(direction[2], origin_at_end=True)) * speed
     is_at_start = texels_passed <= _ROUNDING_STEPS * float_type.eps * max(height, width)
     is_at_start = is_at_start & (hit.face != TOP)
     has_previous = (x >= 0) & (x < width) & (y >= 0) & (y < height) & ~is_at_start
     previous = inverse_depth[jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1)]
     texel = hit.read(inverse_depth)
     # The nearest that the ray may be: its two terms are rounded, and may cancel.
-    travelled = hit.time * direction[:, 2]
-    terms = jnp.abs(origin[:, 2]) + jnp.abs(travelled)
+    travelled = hit.time * direction[2]
+    terms = jnp.abs(origin[2]) + jnp.abs(travelled)
     rounding = _ROUNDING_STEPS * float_type.eps * terms + float_type.tiny
-    ray = origin[:, 2] + travelled - rounding
+    ray = origin[2] + travelled - rounding
     # A baseline search may meet a top from behind; the ray itself then says how far behind.
     before = jnp.where(hit.face == TOP, ray, previous)
     is_gap = (before > texel) & is_depth_step(texel, before, threshold)

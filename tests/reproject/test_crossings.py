@@ -13,9 +13,8 @@ def test_a_ray_comes_in_where_small_steps_first_find_it_inside():
     rng = np.random.default_rng(0)
     origin = rng.uniform(-8, 16, (600, 3))
     direction = rng.normal(size=(600, 3))
-    found = _crossings.entry_texel(
-        _crossings.grid_rays(*map(jnp.asarray, (origin, direction))), HEIGHT, WIDTH
-    )
+    ends = (_crossings.coordinates(jnp.asarray(end)) for end in (origin, direction))
+    found = _crossings.entry_texel(_crossings.grid_rays(*ends), HEIGHT, WIDTH)
     times = np.linspace(0, 60, 60_001)
     seen = 0
     for o, d, x, y, inside in zip(origin, direction, *map(np.asarray, found), strict=True):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes.reproject import run
+from jaxfx.reproject._crossings import coordinates
 from jaxfx.reproject._searches import first_crossing
 from jaxfx.reproject._traversal import level_of, pack, unpack
 from tests.cases.reproject import awkward_rays, field
@@ -48,6 +49,7 @@ def test_rays_from_their_end_meet_what_they_meet_from_their_start(method):
     begin, along = begin[:half], along[:half]
     runs_away = along[:, 2:] > 0
     origin = jnp.where(runs_away, begin + along, begin)
+    origin, begin, along = map(coordinates, (origin, begin, along))
     expected = first_crossing(depth, begin, along, method, None)
     found = first_crossing(depth, origin, along, method, None, origin_at_end=True)
     np.testing.assert_array_equal(found.mask, expected.mask)
@@ -67,8 +69,7 @@ def test_a_ray_that_comes_in_at_an_edge_is_inside_whatever_rounding_says():
     edge = np.stack([np.full(4000, 96), *rng.uniform((0, -1), (96, 0), (4000, 2)).T], axis=-1)
     along = end - edge.astype(np.float32)
     wall = jnp.full((96, 96), -1, jnp.float32)
-    found = first_crossing(
-        wall, jnp.asarray(end), jnp.asarray(along), "pyramid", None, origin_at_end=True
-    )
+    end, along = (coordinates(jnp.asarray(x)) for x in (end, along))
+    found = first_crossing(wall, end, along, "pyramid", None, origin_at_end=True)
     assert found.mask.all()
     assert (np.asarray(found.y) == np.floor(edge[:, 1])).mean() > 0.99
