@@ -91,27 +91,65 @@ def of_batches(
     return unbatched
 
 
-def one_direction_at_a_time(tangent: Callable[..., Any]) -> Callable[..., Any]:
-    """`tangent(static, point, direction)`, of which a batch of directions takes one's memory.
+def of_directions(tangents: Callable[[Any, Any], Array]) -> Callable[[Any, Any], Array]:
+    """`tangents(point, dots)`, of which a batch of directions at one point is one call.
 
-    The derivatives of one image in several parameters are computed one after the other; of
-    several images, each in its own direction, all together.
+    The first axis of each leaf of `dots`, and of the result, is that of the directions. So the
+    derivatives of one image in several parameters share what depends on the image alone. Of a
+    batch of points, each with its directions, `tangents` knows how it is taken.
     """
-    return lambda static, *operands: _of_directions(ft.partial(tangent, static))(*operands)
+    of_all = custom_vmap(tangents)
+    swapped = lambda x: jnp.swapaxes(x, 0, 1)
+
+    @of_all.def_vmap
+    def batch(size, is_batched, point, dots):
+        per_point, per_dots = is_batched
+        dots = jax.tree.map(
+            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (size, *x.shape)),
+            dots,
+            per_dots,
+        )
+        if any(jax.tree.leaves(per_point)):
+            axes = jax.tree.map(lambda has_axis: 0 if has_axis else None, per_point)
+            of_points = of_directions(jax.vmap(tangents, (axes, 1), 1))
+            return swapped(of_points(point, jax.tree.map(swapped, dots))), True
+        out = of_all(point, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), dots))
+        return out.reshape(size, -1, *out.shape[1:]), True
+
+    return of_all
 
 
-def _of_directions(tangent: Callable[..., Any]) -> Callable[..., Any]:
-    of_one = custom_vmap(tangent)
+def in_groups(tangents: Callable[..., Array], most: int) -> Callable[..., Array]:
+    """`tangents(static, point, dots)`, computed for at most `most` directions at once.
 
-    @of_one.def_vmap
-    def batch(_size, is_batched, *operands):
-        if any(jax.tree.leaves(is_batched[0])):
-            out = _of_directions(_at_once(tangent, is_batched))(*operands)
-        else:
-            out = _in_turn(of_one, is_batched)(*operands)
-        return out, jax.tree.map(lambda _: True, out)
+    Many directions then take no more memory than a group.
+    """
 
-    return of_one
+    def grouped(static: Any, point: Any, dots: Any) -> Array:
+        count = len(jax.tree.leaves(dots)[0])
+        groups = -(-count // most)
+        if groups == 1:
+            return tangents(static, point, dots)
+        size = -(-count // groups)
+
+        def split(x):
+            rest = [(0, groups * size - count), *[(0, 0)] * (x.ndim - 1)]
+            return jnp.pad(x, rest).reshape(groups, size, *x.shape[1:])
+
+        of_group = ft.partial(tangents, static, point)
+        out = jax.lax.map(of_group, jax.tree.map(split, dots))
+        return out.reshape(-1, *out.shape[2:])[:count]
+
+    return grouped
+
+
+def one_by_one(tangent: Callable[..., Array]) -> Callable[..., Array]:
+    """`tangents(static, point, dots)` of a `tangent(static, point, dot)`, which takes one."""
+
+    def alone(static: Any, point: Any, dots: Any) -> Array:
+        return tangent(static, point, jax.tree.map(lambda x: x[0], dots))[None]
+
+    return in_groups(alone, 1)
 
 
 def either(

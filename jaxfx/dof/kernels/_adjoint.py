@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from jaxfx._linear import linear
 from jaxfx._loops import varying_as
-from jaxfx._platform import one_by_one_on_cpu
+from jaxfx._platform import of_directions, one_by_one_on_cpu
 
 
 Planes = TypeVar("Planes", bound=Any)
@@ -20,14 +20,15 @@ class Program(NamedTuple):
     """A program for a kernel: functions of the static reach of sprites and of planes.
 
     - `forward(reach, planes)`: the sums.
-    - `tangent(reach, planes, dot)`: their derivative along `dot`.
-    - `adjoint(reach, planes, bar)`: the transpose of that.
+    - `tangents(reach, planes, dots)`: their derivatives along several directions at once. The
+      first axis of `dots`, and of the result, is that of the directions.
+    - `adjoint(reach, planes, bar)`: the transpose of the derivative, at one cotangent.
     - `recorded(reach, planes)`: the sums and a record of them, arrays of floats, which
       `adjoint` then takes as a fourth argument. None where it needs no record.
     """
 
     forward: Callable[[Any, Any], Array]
-    tangent: Callable[[Any, Any, Any], Array]
+    tangents: Callable[[Any, Any, Any], Array]
     adjoint: Callable[..., Any]
     recorded: Callable[[Any, Any], tuple[Array, Any]] | None = None
 
@@ -60,7 +61,7 @@ def with_adjoint(
     both: list[Any] = [
         None if parts[0] is None else mapped(*parts) for parts in zip(*programs, strict=True)
     ]
-    forward, tangent, adjoint, recorded = both
+    forward, tangents, adjoint, recorded = both
 
     @ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
     def kernel(reach: Any, planes: Planes) -> Array:
@@ -72,7 +73,10 @@ def with_adjoint(
 
     def value_and_tangent(reach, planes, dot):
         out, record = with_record(reach, planes)
-        push = ft.partial(tangent, reach, planes)
+        of_all = of_directions(ft.partial(tangents, reach))
+
+        def push(dot):
+            return of_all(planes, jax.tree.map(lambda x: x[None], dot))[0]
 
         def pull(bar):
             return adjoint(reach, planes, bar, *(() if recorded is None else (record,)))

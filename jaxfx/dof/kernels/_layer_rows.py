@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from jaxfx._loops import fori_loop
 from jaxfx._numerics import clip01
-from jaxfx._platform import one_direction_at_a_time
+from jaxfx._platform import one_by_one
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._compositing import (
     Record,
@@ -339,7 +339,7 @@ def _read_back(
 
 SHEET_ROWS = Program(
     together(forward),
-    one_direction_at_a_time(together(tangent)),
+    one_by_one(together(tangent)),
     together(adjoint),
     together(record),
 )

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxfx._loops import cond, scan
 from jaxfx._numerics import clip01
+from jaxfx._platform import in_groups
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
 from jaxfx.dof.kernels._compositing import (
@@ -35,6 +36,10 @@ from jaxfx.dof.kernels._slices import (
     share_of,
 )
 from jaxfx.dof.sprites import POINT_RADIUS, row_half_width
+
+
+# Directions whose tangents are painted at once: with more, the steps leave the cache.
+_DIRECTIONS = 4
 
 
 def composited(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
@@ -66,28 +71,33 @@ def _filled(extent: Extent, sheets: Sheets) -> Filling:
     return grid.each_slice(discs, add, nothing_filled(extent, sheets))
 
 
-def _tangent(
-    extent: Extent, sheets: Sheets, dot: Sheets
-) -> Float[Array, "twice_value height width"]:
+def _tangents(
+    extent: Extent, sheets: Sheets, sheets_dots: Sheets
+) -> Float[Array, "direction twice_value height width"]:
     grid = Grid(extent.reach, sheets)
-    discs, dots = grid.discs(sheets), grid.discs(sheets, dot)
+    discs, dots = grid.discs(sheets), grid.dots(sheets_dots)
+    values, directions = grid.values, dots.shape[2]
 
     def add(index, is_held, state):
-        light, light_dot, late_dot = state
-        arriving, arriving_dot = jnp.split(grid.paint(index, is_held, discs, dots), 2)
+        light, light_dots, late_dots = state
+        painted = grid.paint(index, is_held, discs, dots)
+        arriving, arriving_dots = painted[:values], painted[values:].reshape(light_dots.shape)
         allowed, weight, full = allowance(arriving, light)
         # Where the lens gets full, the share that is filled stays: its tangent is 0.
-        filled_dot = light_dot[-1] + allowed * arriving_dot[-1]
-        allowed_dot = jnp.where(full, -filled_dot / jnp.where(full, arriving[-1], 1), 0)
+        filled_dot = light_dots[:, -1] + allowed[None] * arriving_dots[:, -1]
+        share = jnp.where(full, arriving[-1], 1)
+        allowed_dot = jnp.where(full[None], -filled_dot / share[None], 0)
         added = allowed[None] * arriving
-        added_dot = allowed[None] * arriving_dot + allowed_dot[None] * arriving
-        weight_dot = light_dot[-1] + added_dot[-1] / 2
-        late_dot = late_dot + weight[None] * added_dot + weight_dot[None] * added
-        return light + added, light_dot + added_dot, late_dot
+        added_dots = allowed[None, None] * arriving_dots + allowed_dot[:, None] * arriving[None]
+        weight_dot = light_dots[:, -1] + added_dots[:, -1] / 2
+        late_dots = late_dots + weight[None, None] * added_dots
+        late_dots = late_dots + weight_dot[:, None] * added[None]
+        return light + added, light_dots + added_dots, late_dots
 
     nothing = jnp.zeros(grid.shape, sheets.value.dtype)
-    _, *tangents = grid.each_slice(discs, add, (nothing, nothing, nothing))
-    return jnp.concatenate(tangents)
+    no_dots = jnp.zeros((directions, *grid.shape), sheets.value.dtype)
+    _, *tangents = grid.each_slice(discs, add, (nothing, no_dots, no_dots))
+    return jnp.concatenate(tangents, axis=1)
 
 
 def _adjoint(
@@ -156,5 +166,5 @@ def plain(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height wi
     return jnp.concatenate(scan(jax.checkpoint(add), (nothing, nothing), slices)[0])
 
 
-_BY_SPANS = Program(_forward, _tangent, _adjoint, _recorded)
+_BY_SPANS = Program(_forward, in_groups(_tangents, _DIRECTIONS), _adjoint, _recorded)
 _composited = with_adjoint(_BY_SPANS, plain, SHEET_ROWS)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxfx._loops import fori_loop
-from jaxfx._platform import one_direction_at_a_time
+from jaxfx._platform import one_by_one
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program
 from jaxfx.dof.kernels._taps import Sweep, inside
@@ -116,6 +116,6 @@ def _clip(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 _SWEEP = Sweep(_sums, _clip)
 ROWS = Program(
     together(ft.partial(_taps.forward, _SWEEP)),
-    one_direction_at_a_time(together(ft.partial(_taps.tangent, _SWEEP))),
+    one_by_one(together(ft.partial(_taps.tangent, _SWEEP))),
     together(ft.partial(_taps.adjoint, _SWEEP)),
 )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfx._loops import cond, fori_loop
+from jaxfx._loops import cond, fori_loop, scan
 from jaxfx._numerics import clip01
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels._span_painter import Blocks, Discs, read, too_bright, write
@@ -103,6 +103,11 @@ def across_of(reach: int) -> int:
     return -(-4 * (2 * reach + 1) // 6) + 1
 
 
+def _listed(sheets: Sheets) -> list[Float[Array, "sheet plane height width"]]:
+    value, radius, tilt, place = sheets
+    return [value, radius[:, None], tilt, place[:, None]]
+
+
 class Grid:
     """Sheets divided into blocks, whose discs are painted slice by slice.
 
@@ -116,22 +121,23 @@ class Grid:
         self.blocks = Blocks(sheets.radius.shape[1:], BLOCK, (reach, self.across), beyond=reach)
         self.shape = self.values, *(n - 2 * reach for n in padded)
 
-    def discs(
-        self, sheets: Sheets, dot: Sheets | None = None
-    ) -> Float[Array, "block disc plane"]:
+    def discs(self, sheets: Sheets) -> Float[Array, "block disc plane"]:
         """One row per disc: value, radius, tilt, place, and 1 if it is painted tap by tap.
 
-        `place` is inf for a disc that is not painted. Given `dot`, the tangents of `sheets`,
-        the result has the tangents of value, radius, tilt and place instead.
+        `place` is inf for a disc that is not painted.
         """
-        value, radius, tilt, place = dot or sheets
-        by_taps, fill = jnp.zeros_like(place), 0.0
-        if dot is None:
-            place = jnp.where(self._is_painted(sheets), ordered(place), jnp.inf)
-            by_taps = jax.vmap(too_bright)(value, radius).astype(place.dtype)
-            fill = jnp.inf
-        planes = [value, radius[:, None], tilt, place[:, None], by_taps[:, None]]
-        return self.blocks.listed(jnp.concatenate(planes, axis=1), fill)
+        place = jnp.where(self._is_painted(sheets), ordered(sheets.place), jnp.inf)
+        by_taps = jax.vmap(too_bright)(sheets.value, sheets.radius).astype(place.dtype)
+        planes = [*_listed(sheets._replace(place=place)), by_taps[:, None]]
+        return self.blocks.listed(jnp.concatenate(planes, axis=1), jnp.inf)
+
+    def dots(self, sheets_dots: Sheets) -> Float[Array, "block disc direction plane"]:
+        """The tangents of value, radius, tilt and place, per disc and direction."""
+
+        def of_direction(dot):
+            return self.blocks.listed(jnp.concatenate(_listed(dot), axis=1))
+
+        return jax.vmap(of_direction, out_axes=2)(sheets_dots)
 
     def planes(self, discs: Float[Array, "block disc plane"]) -> Sheets:
         """The sheets that `discs` were made of."""
@@ -177,9 +183,9 @@ class Grid:
         index: Int[Array, ""],
         is_held: Bool[Array, " block"],
         discs: Float[Array, "block disc plane"],
-        dots: Float[Array, "block disc plane"] | None = None,
+        dots: Float[Array, "block disc direction plane"] | None = None,
     ) -> Float[Array, "value height width"]:
-        """The sum of a slice's sprites in the frame; with tangents `dots`, then its tangent."""
+        """The sum of a slice's sprites in the frame; given `dots`, then its tangents too."""
         v = self.values
 
         def write_chunk(block, steps, ids, share, share_slope, tap):
@@ -189,9 +195,10 @@ class Grid:
             if dots is not None:
                 rows = dots[block, ids]
                 dot = self._disc(rows)
-                value_dot = dot.value * share[:, None]
-                share_dot = share_slope * rows[:, v + 3]
-                dot = dot._replace(value=value_dot + disc.value * share_dot[:, None])
+                value_dot = dot.value * share[:, None, None]
+                share_dot = share_slope[:, None] * rows[..., v + 3]
+                value_dot = value_dot + disc.value[:, None] * share_dot[..., None]
+                dot = dot._replace(value=value_dot)
             # What belongs to another slice only fills up the chunk: its radius must not count.
             shared = shared._replace(radius=jnp.where(share > 0, disc.radius, 0))
             places = self.blocks.places(disc.value.dtype, ids, tap)
@@ -200,7 +207,7 @@ class Grid:
         def write_block(block, steps):
             return self._each_chunk(index, block, discs, write_chunk, steps)
 
-        shape = (1 if dots is None else 2), v
+        shape = (1 if dots is None else 1 + dots.shape[2]), v
         return self.blocks.paint(is_held, write_block, shape, discs.dtype)
 
     def read_back(
@@ -232,10 +239,10 @@ class Grid:
 
         return self.blocks.read_back(is_held, read_block, bar, bars)
 
-    def _disc(self, rows: Float[Array, "disc plane"]) -> Discs:
-        """Some rows of `discs` without what belongs to slices."""
+    def _disc(self, rows: Float[Array, "disc *direction plane"]) -> Discs:
+        """Some rows of `discs` or `dots` without what belongs to slices."""
         v = self.values
-        return Discs(rows[:, :v], rows[:, v], (rows[:, v + 1], rows[:, v + 2]))
+        return Discs(rows[..., :v], rows[..., v], (rows[..., v + 1], rows[..., v + 2]))
 
     def _each_chunk(self, index, block, discs, visit, carry):
         """Fold `visit(block, carry, ids, share, share_slope, tap)` over a slice's discs.
@@ -250,7 +257,7 @@ class Grid:
 
         def fold(carry, held, chunk, column):
             size, taps = len(held), 1 if column is None else len(column)
-            at = jnp.where(held, jnp.cumsum(held) - 1, size + chunk)
+            at = jnp.where(held, self._numbers(held), size + chunk)
             ids = jnp.zeros(size + chunk, int).at[at].set(jnp.arange(size), mode="drop")
             count = held.sum()
 
@@ -269,4 +276,17 @@ class Grid:
 
         held = share_of(beyond) > 0
         carry = fold(carry, held & ~bright, CHUNK, None)
-        return fold(carry, held & bright, BRIGHT_CHUNK, columns)
+        too_bright = held & bright
+        fold_bright = lambda carry: fold(carry, too_bright, BRIGHT_CHUNK, columns)
+        return cond(too_bright.any(), fold_bright, lambda carry: carry, carry)
+
+    def _numbers(self, held: Bool[Array, " disc"]) -> Int[Array, " disc"]:
+        """How many discs of a block are held before each, row by row.
+
+        By a loop over columns: XLA:CPU takes three times as long for a cumulative sum.
+        """
+        columns = held.reshape(self.blocks.block).T.astype(jnp.int32)
+        nothing = jnp.zeros_like(columns[0])
+        counts, before = scan(lambda sums, x: (sums + x, sums), nothing, columns)
+        above = jnp.cumsum(counts) - counts
+        return (above[None] + before).T.reshape(-1)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._numerics import clip01
+from jaxfx._platform import in_groups
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels import _tiles
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
@@ -28,6 +29,10 @@ from jaxfx.dof.sprites import POINT_RADIUS, Sprites
 # Height and width of a block in pixels: enough discs to spread the overhead of a row; their
 # steps fill a megabyte at a radius of 64. Larger blocks do not fit into a core's cache.
 BLOCK = (32, 128)
+
+
+# Directions whose tangents are painted at once: with more, the steps leave the cache.
+_DIRECTIONS = 4
 
 
 def spans(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
@@ -49,32 +54,52 @@ def _parts(
 
 
 def paint(
+    reach: int, value: Float[Array, "value height width"], radius: Float[Array, "height width"]
+) -> Float[Array, "value height width"]:
+    """The sum of all discs, each its value times its coverage; a radius of 0 is no disc."""
+    blocks = _blocks(reach, radius)
+    planes = [*map(blocks.whole, (value, radius[None]))]
+
+    def write_block(block, steps):
+        discs = _there(_cut(blocks, planes, block))
+        return write(blocks, blocks.places(radius.dtype), discs, steps)
+
+    return blocks.paint(blocks.are_held(radius), write_block, (1, len(value)), value.dtype)
+
+
+def paint_tangents(
     reach: int,
     value: Float[Array, "value height width"],
     radius: Float[Array, "height width"],
-    dot: tuple[Float[Array, "value height width"], Float[Array, "height width"]] | None = None,
-) -> Float[Array, "value height width"]:
-    """The sum of all discs, each its value times its coverage; a radius of 0 is no disc.
-
-    Given `dot`, tangents of value and radius, the derivative of that along them.
-    """
+    value_dots: Float[Array, "direction value height width"],
+    radius_dots: Float[Array, "direction height width"],
+) -> Float[Array, "direction value height width"]:
+    """The derivatives of `paint` along tangents of value and radius."""
     blocks = _blocks(reach, radius)
     planes = [*map(blocks.whole, (value, radius[None]))]
-    dots = None if dot is None else [*map(blocks.whole, (dot[0], dot[1][None]))]
+    directions, values, *size = value_dots.shape
+    dots = [*map(blocks.whole, (value_dots.reshape(-1, *size), radius_dots))]
 
     def write_block(block, steps):
         discs = _cut(blocks, planes, block)
-        there = discs.radius[:, None] > 0
-        # What is no disc must write nothing: two steps that cancel would leave their rounding.
-        discs = discs._replace(value=jnp.where(there, discs.value, 0))
+        there = discs.radius[:, None, None] > 0
+        value_dot, radius_dot = (blocks.cut(x, block) for x in dots)
+        value_dot = value_dot.reshape(-1, directions, values)
+        moved = Discs(jnp.where(there, value_dot, 0), radius_dot)
         places = blocks.places(radius.dtype)
-        if dots is None:
-            return write(blocks, places, discs, steps)
-        moved = _cut(blocks, dots, block)
-        moved = moved._replace(value=jnp.where(there, moved.value, 0))
-        return write(blocks, places, discs, steps, moved, tangent_only=True)
+        return write(blocks, places, _there(discs), steps, moved, tangents_only=True)
 
-    return blocks.paint(blocks.are_held(radius), write_block, (1, len(value)), value.dtype)
+    shape = directions, values
+    painted = blocks.paint(blocks.are_held(radius), write_block, shape, value.dtype)
+    return painted.reshape(*shape, *painted.shape[1:])
+
+
+def _there(discs: Discs) -> Discs:
+    """The discs, of which those that are none write nothing.
+
+    Two steps that cancel would leave their rounding.
+    """
+    return discs._replace(value=jnp.where(discs.radius[:, None] > 0, discs.value, 0))
 
 
 def read_back(
@@ -123,18 +148,21 @@ def _forward(reach: int, planes: Planes) -> Float[Array, "value height width"]:
     return sums + _tiles.forward(reach, near)
 
 
-def _tangent(reach: int, planes: Planes, dot: Planes) -> Float[Array, "value height width"]:
+def _tangents(
+    reach: int, planes: Planes, dots: Planes
+) -> Float[Array, "direction value height width"]:
     direct, near, (before, behind) = _parts(planes)
     value, blurred = planes.value, clip01(planes.coc - 1)
-    dots = dot.value, dot.radius
-    sums = blurred[None] * paint(reach, value, behind, dots)
-    blurred_dot = inside(planes.coc - 1) * dot.coc
-    sums = sums + blurred_dot[None] * paint(reach, value, behind)
-    sums = sums + paint(reach, value, before, dots)
-    near_dot = dot._replace(
-        value=jnp.where(direct[None], dot.value, 0), radius=jnp.where(direct, dot.radius, 0)
+    sums = paint_tangents(reach, value, behind, dots.value, dots.radius)
+    blurred_dot = inside(planes.coc - 1)[None] * dots.coc
+    sums = blurred[None, None] * sums
+    sums = sums + blurred_dot[:, None] * paint(reach, value, behind)[None]
+    sums = sums + paint_tangents(reach, value, before, dots.value, dots.radius)
+    near_dots = dots._replace(
+        value=jnp.where(direct[None, None], dots.value, 0),
+        radius=jnp.where(direct[None], dots.radius, 0),
     )
-    return sums + _tiles.tangent(reach, near, near_dot)
+    return sums + _tiles.tangents(reach, near, near_dots)
 
 
 def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]) -> Planes:
@@ -153,5 +181,5 @@ def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]
     return Planes(*bars, near_bar.leak, coc_bar)
 
 
-SPANS = Program(_forward, _tangent, _adjoint)
+SPANS = Program(_forward, in_groups(_tangents, _DIRECTIONS), _adjoint)
 _sums = with_adjoint(SPANS, _tiles.plain)

@@ -22,7 +22,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxfx._loops import fori_loop, switch
-from jaxfx._platform import by_platform
+from jaxfx._platform import by_platform, one_by_one
 from jaxfx.dof.kernels import _taps
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
 from jaxfx.dof.kernels._rows import ROWS
@@ -238,10 +238,10 @@ def _tile_reaches(
 
 _SWEEP = Sweep(_sweep, clip)
 forward = ft.partial(_taps.forward, _SWEEP)
-tangent = ft.partial(_taps.tangent, _SWEEP)
+tangents = one_by_one(ft.partial(_taps.tangent, _SWEEP))
 adjoint = ft.partial(_taps.adjoint, _SWEEP)
-TILES = Program(forward, tangent, adjoint)
-SHIFTS = Program(plain, tangent, adjoint)  # the derivatives of `shift` take longer
+TILES = Program(forward, tangents, adjoint)
+SHIFTS = Program(plain, tangents, adjoint)  # the derivatives of `shift` take longer
 _sums = with_adjoint(TILES, plain)
 _all = with_adjoint(TILES, plain, ROWS)
 _by_rows = with_adjoint(ROWS, plain)
