@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from jaxfx._platform import by_platform, either, one_by_one_on_cpu
+from jaxfx._platform import (
+    by_platform,
+    either,
+    in_groups,
+    of_directions,
+    one_by_one,
+    one_by_one_on_cpu,
+)
 from tests.helpers.programs import for_accelerators
 
 
@@ -72,3 +79,60 @@ def test_either_computes_one_of_two():
         text = _lowered(batch, x, by[0], platform=platform)
         assert ("stablehlo.while" in text) == (platform == "cpu")
         assert "stablehlo.case" in text
+
+
+def _counted(calls):
+    """`tangents(point, dots)` of `point["a"] ** 2 * point["b"]`, which notes each trace."""
+
+    def tangents(point, dots):
+        calls.append(len(dots["a"]))
+        a, b = point["a"][None], point["b"][None]
+        return 2 * a * b * dots["a"] + a * a * dots["b"]
+
+    return tangents
+
+
+def test_directions_at_one_point_are_one_call_whatever_the_order_of_the_batches():
+    rng = np.random.default_rng(0)
+    points = {name: jnp.asarray(rng.normal(size=(2, 3))) for name in "ab"}
+    dots = {name: jnp.asarray(rng.normal(size=(5, 2, 3))) for name in "ab"}
+    numbers = lambda *trees: [np.asarray(x) for tree in trees for x in tree.values()]
+    product = lambda a, b, a_dot, b_dot: 2 * a * b * a_dot + a**2 * b_dot
+    expected = product(*numbers(points, dots))
+    calls = []
+
+    def along(point, dot):
+        return of_directions(_counted(calls))(point, jax.tree.map(lambda x: x[None], dot))[0]
+
+    of_points = jax.vmap(along)
+    outside = jax.vmap(of_points, (None, 0))
+    inside = jax.vmap(jax.vmap(along, (None, 0)), (0, 1), 1)
+    for function in (outside, inside, jax.jit(outside)):
+        calls.clear()
+        np.testing.assert_allclose(function(points, dots), expected, rtol=1e-12)
+        assert calls[-1] == 5
+    first = jax.tree.map(lambda x: x[0], points)
+    # Of a direction, that of one leaf alone may be in the batch; and batches of batches.
+    mixed = {"a": dots["a"][:, 0], "b": dots["b"][0, 0]}
+    found = jax.vmap(along, (None, {"a": 0, "b": None}))(first, mixed)
+    np.testing.assert_allclose(found, product(*numbers(first, mixed)), rtol=1e-12)
+    of_all = jax.vmap(jax.vmap(along, (None, 0)), (None, 1), 1)
+    found = of_all(first, dots)
+    np.testing.assert_allclose(found, product(*numbers(first, dots)), rtol=1e-12)
+    assert calls[-1] == 10
+
+
+def test_many_directions_are_computed_in_groups():
+    rng = np.random.default_rng(0)
+    point = {name: jnp.asarray(rng.normal(size=3)) for name in "ab"}
+    for count in (1, 4, 5, 9):
+        dots = {name: jnp.asarray(rng.normal(size=(count, 3))) for name in "ab"}
+        calls = []
+        tangents = _counted(calls)
+        whole = tangents(point, dots)
+        calls.clear()
+        grouped = in_groups(lambda static, *data, f=tangents: static * f(*data), 4)
+        np.testing.assert_allclose(grouped(2, point, dots), 2 * whole, rtol=1e-12)
+        assert max(calls) == {1: 1, 4: 4, 5: 3, 9: 3}[count]
+        one = lambda _, point, dot: jax.jvp(lambda p: p["a"] ** 2 * p["b"], (point,), (dot,))[1]
+        np.testing.assert_allclose(one_by_one(one)(0, point, dots), whole, rtol=1e-12)

@@ -60,7 +60,9 @@ def focus_planes(rng, size):
 
 
 def iris(rng, size):
-    return jaxfx.dof.Iris(5, rng.uniform(0, 1), roundness=rng.uniform(0.3, 0.6), squeeze=0.8)
+    # A vignetting of 0 has nothing below it: no difference quotient.
+    shape = {"roundness": rng.uniform(0.3, 0.6), "squeeze": 0.8, "vignetting": 0.2}
+    return jaxfx.dof.Iris(5, rng.uniform(0, 1), **shape)
 
 
 def pinhole(rng, size):

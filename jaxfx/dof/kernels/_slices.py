@@ -131,7 +131,7 @@ class Grid:
         planes = [*_listed(sheets._replace(place=place)), by_taps[:, None]]
         return self.blocks.listed(jnp.concatenate(planes, axis=1), jnp.inf)
 
-    def dots(self, sheets_dots: Sheets) -> Float[Array, "block disc direction plane"]:
+    def dots(self, sheets_dots: Sheets) -> Float[Array, "block disc direction dot"]:
         """The tangents of value, radius, tilt and place, per disc and direction."""
 
         def of_direction(dot):
@@ -183,7 +183,7 @@ class Grid:
         index: Int[Array, ""],
         is_held: Bool[Array, " block"],
         discs: Float[Array, "block disc plane"],
-        dots: Float[Array, "block disc direction plane"] | None = None,
+        dots: Float[Array, "block disc direction dot"] | None = None,
     ) -> Float[Array, "value height width"]:
         """The sum of a slice's sprites in the frame; given `dots`, then its tangents too."""
         v = self.values

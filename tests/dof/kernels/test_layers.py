@@ -74,19 +74,26 @@ def check_derivatives(extent):
     """Both modes, of several blocks' sprites, spans and taps, before and behind what fills."""
     sheets = random_sheets(2)
     rng = np.random.default_rng(1)
-    along = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), sheets)
+    one, other = (
+        jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), sheets) for _ in range(2)
+    )
+    # Several directions are painted at once.
+    several = jax.tree.map(lambda x, y: jnp.stack([x, y, x - 2 * y]), one, other)
 
     @jax.jit
-    def derivatives(sheets, along):
-        dense = jax.jvp(functools.partial(_layers.plain, extent), (sheets,), (along,))[1]
+    def derivatives(sheets, several):
+        first = jax.tree.map(lambda x: x[0], several)
+        dense = jax.jvp(functools.partial(_layers.plain, extent), (sheets,), (first,))[1]
         composited = functools.partial(_layers.composited, extent)
-        tangent = jax.jvp(composited, (sheets,), (along,))[1]
+        push = jax.linearize(composited, sheets)[1]
         # Itself is as good a direction to pull back as any.
-        return tangent, dense, jax.vjp(composited, sheets)[1](dense)[0]
+        return jax.vmap(push)(several), dense, jax.vjp(composited, sheets)[1](dense)[0]
 
-    tangent, dense, found = derivatives(sheets, along)
+    (tangent, second, third), dense, found = derivatives(sheets, several)
     assert_close(tangent, dense)
-    product = sum(jnp.vdot(x, y) for x, y in zip(found, along, strict=True))
+    assert_close(third, tangent - 2 * second)
+    assert np.abs(np.asarray(tangent - second)).max() > 0.1
+    product = sum(jnp.vdot(x, y) for x, y in zip(found, one, strict=True))
     np.testing.assert_allclose(product, jnp.vdot(dense, dense), rtol=1e-9)
 
 
