@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfx.dof.kernels._spans import BLOCK, paint, read_back
+from jaxfx.dof.kernels._spans import BLOCK, paint, paint_tangents, read_back
 from jaxfx.dof.sprites import coverage, row_half_width
 
 
@@ -44,7 +44,10 @@ def test_the_tangent_is_the_difference_quotient():
     dot = dot[0], jnp.where(radius > 0.6, dot[1], 0)
     step = 1e-7
     ends = [paint(REACH, value + h * dot[0], radius + h * dot[1]) for h in (step, -step)]
-    tangent = paint(REACH, value, radius, dot)
+    several = (jnp.stack([x, -x, 2 * x]) for x in dot)
+    tangent, turned, twice = paint_tangents(REACH, value, radius, *several)
+    np.testing.assert_allclose(turned, -tangent, atol=1e-12)
+    np.testing.assert_allclose(twice, 2 * tangent, atol=1e-12)
     np.testing.assert_allclose(tangent, (ends[0] - ends[1]) / (2 * step), atol=2e-6)
 
 
@@ -54,7 +57,8 @@ def test_reading_back_is_the_transpose():
     bar = jnp.asarray(np.random.default_rng(4).normal(size=value.shape))
     nothing = jnp.zeros_like(value), jnp.zeros_like(radius)
     bars = read_back(REACH, value, radius, bar, nothing)
-    pushed = jnp.vdot(paint(REACH, value, radius, dot), bar)
+    tangents = paint_tangents(REACH, value, radius, *(x[None] for x in dot))
+    pushed = jnp.vdot(tangents[0], bar)
     pulled = sum(map(jnp.vdot, dot, bars))
     np.testing.assert_allclose(pushed, pulled, rtol=1e-11)
     again = jax.tree.map(lambda x, y: x - y, read_back(REACH, value, radius, bar, bars), bars)
