@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Int8, Int16
 
 
-# x, y and z of points or directions, each an array over rays. One array of three columns would
-# be kept in two orders by XLA for a GPU, and cost it instructions that only take columns out.
+# x, y and z of points or directions, each an array over rays. Of one array with three columns,
+# XLA for a GPU would keep two orders where some of its readers want the columns.
 Coordinates = tuple[Float[Array, " ray"], Float[Array, " ray"], Float[Array, " ray"]]
 
 # The face through which a ray meets a texel's column: its top, a side at a border in x or in y,

@@ -35,11 +35,8 @@ from jaxfx.dof.kernels._slices import (
     ordered,
     share_of,
 )
+from jaxfx.dof.kernels._span_painter import DIRECTIONS
 from jaxfx.dof.sprites import POINT_RADIUS, row_half_width
-
-
-# Directions whose tangents are painted at once: with more, the steps leave the cache.
-_DIRECTIONS = 4
 
 
 def composited(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height width"]:
@@ -166,5 +163,5 @@ def plain(extent: Extent, sheets: Sheets) -> Float[Array, "twice_value height wi
     return jnp.concatenate(scan(jax.checkpoint(add), (nothing, nothing), slices)[0])
 
 
-_BY_SPANS = Program(_forward, in_groups(_tangents, _DIRECTIONS), _adjoint, _recorded)
+_BY_SPANS = Program(_forward, in_groups(_tangents, DIRECTIONS), _adjoint, _recorded)
 _composited = with_adjoint(_BY_SPANS, plain, SHEET_ROWS)

@@ -103,7 +103,8 @@ def across_of(reach: int) -> int:
     return -(-4 * (2 * reach + 1) // 6) + 1
 
 
-def _listed(sheets: Sheets) -> list[Float[Array, "sheet plane height width"]]:
+def _planes_of(sheets: Sheets) -> list[Float[Array, "sheet plane height width"]]:
+    """What discs have, in the order of the rows of `Grid.discs`: value, radius, tilt, place."""
     value, radius, tilt, place = sheets
     return [value, radius[:, None], tilt, place[:, None]]
 
@@ -128,14 +129,14 @@ class Grid:
         """
         place = jnp.where(self._is_painted(sheets), ordered(sheets.place), jnp.inf)
         by_taps = jax.vmap(too_bright)(sheets.value, sheets.radius).astype(place.dtype)
-        planes = [*_listed(sheets._replace(place=place)), by_taps[:, None]]
+        planes = [*_planes_of(sheets._replace(place=place)), by_taps[:, None]]
         return self.blocks.listed(jnp.concatenate(planes, axis=1), jnp.inf)
 
     def dots(self, sheets_dots: Sheets) -> Float[Array, "block disc direction dot"]:
         """The tangents of value, radius, tilt and place, per disc and direction."""
 
         def of_direction(dot):
-            return self.blocks.listed(jnp.concatenate(_listed(dot), axis=1))
+            return self.blocks.listed(jnp.concatenate(_planes_of(dot), axis=1))
 
         return jax.vmap(of_direction, out_axes=2)(sheets_dots)
 
@@ -257,7 +258,7 @@ class Grid:
 
         def fold(carry, held, chunk, column):
             size, taps = len(held), 1 if column is None else len(column)
-            at = jnp.where(held, self._numbers(held), size + chunk)
+            at = jnp.where(held, self._held_before(held), size + chunk)
             ids = jnp.zeros(size + chunk, int).at[at].set(jnp.arange(size), mode="drop")
             count = held.sum()
 
@@ -280,7 +281,7 @@ class Grid:
         fold_bright = lambda carry: fold(carry, too_bright, BRIGHT_CHUNK, columns)
         return cond(too_bright.any(), fold_bright, lambda carry: carry, carry)
 
-    def _numbers(self, held: Bool[Array, " disc"]) -> Int[Array, " disc"]:
+    def _held_before(self, held: Bool[Array, " disc"]) -> Int[Array, " disc"]:
         """How many discs of a block are held before each, row by row.
 
         By a loop over columns: XLA:CPU takes three times as long for a cumulative sum.

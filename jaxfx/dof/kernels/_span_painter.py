@@ -45,6 +45,9 @@ from jaxfx.dof.sprites import POINT_RADIUS, segment_integral
 # running sum: in float32 it would leave 1e-6 of that sum along its row. With a larger ratio
 # streaks show beside lights; with a smaller one more discs are painted slowly.
 _HIGHLIGHT = 16.0
+# Directions whose tangents are painted at once. More share more and take more memory: the steps
+# of a block take 1 + DIRECTIONS times those of its discs. A wrong value costs time only.
+DIRECTIONS = 4
 
 
 class Discs(NamedTuple):
@@ -256,34 +259,36 @@ def write(
     """
     # Planes of discs: loops over the few values of a disc are slow.
     value = discs.value.T[None]
-    values, motion = value, []
+    values, radius_dots, tilt_dots = value, None, None
     if dots is not None:
+        # The discs themselves are a first direction, without motion.
+        still = [] if tangents_only else [jnp.zeros_like(discs.radius)[None]]
         values = jnp.moveaxis(dots.value, 0, -1)
-        motion = [x.T for x in (dots.radius, *(dots.tilt or ()))]
-        if not tangents_only:
-            # The discs themselves are a first direction, without motion.
-            values = jnp.concatenate([value, values])
-            motion = [jnp.pad(x, ((1, 0), (0, 0))) for x in motion]
+        values = values if tangents_only else jnp.concatenate([value, values])
+        motion = lambda dot: jnp.concatenate([*still, dot.T])
+        radius_dots = motion(dots.radius)
+        tilt_dots = None if dots.tilt is None else [motion(dot) for dot in dots.tilt]
 
     def planes_of(row, end):
+        """The steps of an end in a row: A and then B, each of all values, as planes."""
         weight = jnp.full_like(end.cut, -end.side)
         if discs.tilt is not None:
             weight = weight * (1 + row * discs.tilt[1])
         whole = weight[None, None] * values
-        if len(motion) > 1:
-            whole = whole + (-end.side * row * motion[2])[:, None] * value
+        if tilt_dots is not None:
+            whole = whole + (-end.side * row * tilt_dots[1])[:, None] * value
         part = end.cut[None, None] * whole
-        if motion:
-            moved = end.by_radius[None] * motion[0]
-            if len(motion) > 1:
-                moved = moved + end.by_tilt[None] * motion[1]
+        if radius_dots is not None:
+            moved = end.by_radius[None] * radius_dots
+            if tilt_dots is not None:
+                moved = moved + end.by_tilt[None] * tilt_dots[0]
             part = part + (weight[None] * moved)[:, None] * value
         return jnp.concatenate([end.whole * whole, part]).reshape(-1, len(weight))
 
     def visit(steps, row, cells, end):
-        write = lambda: [planes_of(y, end) for y in (row, -row)]
+        both = lambda: [planes_of(y, end) for y in (row, -row)]
         # Many planes in memory: XLA would transpose them and all that leads to them as one.
-        planes = write() if dots is None else stored(row >= 0, write)
+        planes = both() if dots is None else stored(row >= 0, both)
         for cell, written in zip(cells, planes, strict=True):
             steps = _add(steps, cell, written.T)
         return steps

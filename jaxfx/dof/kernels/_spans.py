@@ -21,7 +21,7 @@ from jaxfx._platform import in_groups
 from jaxfx._xla import sum_planes
 from jaxfx.dof.kernels import _tiles
 from jaxfx.dof.kernels._adjoint import Program, with_adjoint
-from jaxfx.dof.kernels._span_painter import Blocks, Discs, read, too_bright, write
+from jaxfx.dof.kernels._span_painter import DIRECTIONS, Blocks, Discs, read, too_bright, write
 from jaxfx.dof.kernels._taps import UNCOUPLED, Planes, inside, to_planes
 from jaxfx.dof.sprites import POINT_RADIUS, Sprites
 
@@ -29,10 +29,6 @@ from jaxfx.dof.sprites import POINT_RADIUS, Sprites
 # Height and width of a block in pixels: enough discs to spread the overhead of a row; their
 # steps fill a megabyte at a radius of 64. Larger blocks do not fit into a core's cache.
 BLOCK = (32, 128)
-
-
-# Directions whose tangents are painted at once: with more, the steps leave the cache.
-_DIRECTIONS = 4
 
 
 def spans(sprites: Sprites, reach: int) -> Float[Array, "height width value"]:
@@ -181,5 +177,5 @@ def _adjoint(reach: int, planes: Planes, bar: Float[Array, "value height width"]
     return Planes(*bars, near_bar.leak, coc_bar)
 
 
-SPANS = Program(_forward, in_groups(_tangents, _DIRECTIONS), _adjoint)
+SPANS = Program(_forward, in_groups(_tangents, DIRECTIONS), _adjoint)
 _sums = with_adjoint(SPANS, _tiles.plain)
