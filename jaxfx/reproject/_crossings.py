@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Int8, Int16
+from jaxtyping import Array, Bool, Float, Int, Int8, Int16, Int32
 
 
 # x, y and z of points or directions, each an array over rays. Of one array with three columns,
@@ -105,18 +105,18 @@ def grid_rays(
 def crossing_moment(border: Array, o: Array, i: Array, backward: Array) -> Moment:
     """When rays cross a border of one axis: never, +inf or -inf, where they are parallel to it.
 
-    `o` is the origin on that axis and `i` the reciprocal of the direction. `backward` is 1
-    where a ray runs towards smaller coordinates, else 0.
+    `o` is the origin on that axis and `i` the reciprocal of the direction; `backward` says
+    which rays run towards smaller coordinates.
     """
-    return Moment((border.astype(o.dtype) - o) * i, backward == 1)
+    return Moment((border.astype(o.dtype) - o) * i, backward)
 
 
 def axis_entries(
     r: GridRays, x: Array, y: Array, left: Array, up: Array
 ) -> tuple[Moment, Moment]:
     """When rays, as lines without a start, enter column `x`, and when they enter row `y`."""
-    enter_x = crossing_moment(x + left, r.ox, r.ix, left)
-    enter_y = crossing_moment(y + up, r.oy, r.iy, up)
+    enter_x = crossing_moment(x + as_int(left), r.ox, r.ix, left)
+    enter_y = crossing_moment(y + as_int(up), r.oy, r.iy, up)
     return enter_x, enter_y
 
 
@@ -156,30 +156,28 @@ def later(a: Moment, b: Moment) -> Moment:
     return Moment(jnp.maximum(a.time, b.time), after)
 
 
-def earlier(a: Moment, b: Moment) -> Moment:
-    """The earlier of two moments."""
-    after = jnp.where(a.time < b.time, a.after, b.after)
-    after = jnp.where(a.time == b.time, a.after & b.after, after)
-    return Moment(jnp.minimum(a.time, b.time), after)
-
-
 def texel_at(moment: Moment, o: Array, d: Array, backward: Array) -> Int[Array, "..."]:
     """The row or column in which rays are at a moment."""
     coordinate = o + moment.time * d
-    has_crossed = moment.after & (backward == 1)
+    has_crossed = moment.after & backward
     texel = jnp.where(has_crossed, jnp.ceil(coordinate) - 1, jnp.floor(coordinate))
     return texel.astype(jnp.int32)
 
 
-def backward_axes(r: GridRays) -> tuple[Int[Array, " ray"], Int[Array, " ray"]]:
-    """1 where a ray runs to the left, and 1 where it runs upwards; else 0."""
-    return (r.dx < 0).astype(jnp.int32), (r.dy < 0).astype(jnp.int32)
+def backward_axes(r: GridRays) -> tuple[Bool[Array, " ray"], Bool[Array, " ray"]]:
+    """Which rays run to the left, and which upwards."""
+    return r.dx < 0, r.dy < 0
+
+
+def as_int(flags: Bool[Array, "..."]) -> Int32[Array, "..."]:
+    """Flags as 1 and 0."""
+    return flags.astype(jnp.int32)
 
 
 def entry_texel(r: GridRays, height: int, width: int) -> EntryTexel:
     """The texel at which rays enter the image, or that in which they start."""
     left, up = backward_axes(r)
-    edge_x, edge_y = left * (width - 1), up * (height - 1)
+    edge_x, edge_y = as_int(left) * (width - 1), as_int(up) * (height - 1)
     enter_x, enter_y = axis_entries(r, edge_x, edge_y, left, up)
     entry = texel_entry(r, enter_x, enter_y)
     x_then, y_then = texel_at(entry, r.ox, r.dx, left), texel_at(entry, r.oy, r.dy, up)
@@ -195,5 +193,5 @@ def _not_outside(edge: Array, backward: Array, texel: Array, has_passed: Array) 
 
     It is `edge` itself where the ray has not passed it, and never on the outer side of it.
     """
-    inner = jnp.where(backward == 1, jnp.minimum(texel, edge), jnp.maximum(texel, edge))
+    inner = jnp.where(backward, jnp.minimum(texel, edge), jnp.maximum(texel, edge))
     return jnp.where(has_passed, inner, edge)

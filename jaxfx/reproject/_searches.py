@@ -27,6 +27,7 @@ from jaxfx.reproject._crossings import (
     EntryTexel,
     GridRays,
     TexelHit,
+    as_int,
     axis_entries,
     backward_axes,
     crossing_moment,
@@ -229,8 +230,8 @@ def _time_range(height_field: Array, r: GridRays, entry: EntryTexel) -> tuple[Ar
     left, up = backward_axes(r)
     x, y = (jnp.where(entry.inside, texel, 0) for texel in (entry.x, entry.y))
     start = texel_entry(r, *axis_entries(r, x, y, left, up)).time
-    leave_x = crossing_moment((1 - left) * width, r.ox, r.ix, left).time
-    leave_y = crossing_moment((1 - up) * height, r.oy, r.iy, up).time
+    leave_x = crossing_moment((1 - as_int(left)) * width, r.ox, r.ix, left).time
+    leave_y = crossing_moment((1 - as_int(up)) * height, r.oy, r.iy, up).time
     farthest = jnp.max(jnp.where(height_field < jnp.inf, height_field, -jnp.inf))
     # A margin for rounding: the last step must be behind the farthest texel as well.
     terms = jnp.abs(farthest) + jnp.abs(r.oz) + jnp.abs(start * r.dz)

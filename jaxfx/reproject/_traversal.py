@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, Int32
 
 from jaxfx._loops import while_loop
 from jaxfx._platform import by_platform
@@ -36,10 +36,10 @@ from jaxfx.reproject._crossings import (
     GridRays,
     Moment,
     TexelHit,
+    as_int,
     axis_entries,
     backward_axes,
     crossing_moment,
-    earlier,
     entry_texel,
     grid_rays,
     is_earlier,
@@ -49,14 +49,11 @@ from jaxfx.reproject._crossings import (
 )
 
 
-# Bits of a state for the texel's x, and for its y. With 2 signs and 4 bits of level: 32 bits.
-_TEXEL_BITS = 13
+# Bits of a state for the level, for the texel's x, and for its y. With 2 for directions: 32.
+_LEVEL_BITS, _TEXEL_BITS = 4, 13
 # The largest height and width in texels: what 13 bits count. Checked for every argument.
 LARGEST_SIDE = 2**_TEXEL_BITS
-_TEXEL_MASK = LARGEST_SIDE - 1
-_LEVEL_SHIFT = 2 * _TEXEL_BITS + 2
-# Values in place of a level that mean that a ray is done. Real levels are 0 to 13; the field
-# has 4 bits.
+# Values in place of a level that mean that a ray is done. Real levels are 0 to 13.
 HIT, MISS = 15, 14
 # Rays. Up to this number rays are not packed: that would cost more than the steps saved.
 # Measured; a wrong value costs time only.
@@ -82,47 +79,49 @@ _LEVEL_STRIDE = 2
 _START_CELLS = 4
 
 
-def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> UInt32[Array, "..."]:
-    """The state of rays in texel (x, y). From the lowest bit: x, y, up, left, level.
+def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> Int32[Array, "..."]:
+    """The state of rays in texel (x, y). From the lowest bit: level, x, y, left, up.
 
     `left` and `up` are 1 for a ray that runs towards smaller x and towards smaller y, else 0.
+    They follow from the ray, but XLA would compute them once, and read them in every step.
     """
-    bits = level.astype(jnp.uint32)
-    for size, value in ((1, left), (1, up), (_TEXEL_BITS, y), (_TEXEL_BITS, x)):
-        bits = (bits << size) | value.astype(jnp.uint32)
+    bits = up << 1 | left
+    for size, value in ((_TEXEL_BITS, y), (_TEXEL_BITS, x), (_LEVEL_BITS, level)):
+        bits = bits << size | value
     return bits
 
 
-def unpack(state: UInt32[Array, "..."]) -> tuple[Array, Array, Array, Array, Array]:
+def unpack(state: Int32[Array, "..."]) -> tuple[Array, Array, Array, Array, Array]:
     """The arguments of `pack`, from its result."""
-    x = (state & _TEXEL_MASK).astype(jnp.int32)
-    y = ((state >> _TEXEL_BITS) & _TEXEL_MASK).astype(jnp.int32)
-    up, left = (
-        ((state >> bit) & 1).astype(jnp.int32) for bit in (2 * _TEXEL_BITS, 2 * _TEXEL_BITS + 1)
-    )
-    return x, y, level_of(state).astype(jnp.int32), left, up
+    x_bit, y_bit = _LEVEL_BITS, _LEVEL_BITS + _TEXEL_BITS
+    x, y = ((state >> bit) & (LARGEST_SIDE - 1) for bit in (x_bit, y_bit))
+    left, up = ((state >> bit) & 1 for bit in (y_bit + _TEXEL_BITS, y_bit + _TEXEL_BITS + 1))
+    return x, y, level_of(state), left, up
 
 
-def level_of(state: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
+def level_of(state: Int32[Array, "..."]) -> Int32[Array, "..."]:
     """The level of a state."""
-    return state >> _LEVEL_SHIFT
+    return state & (2**_LEVEL_BITS - 1)
 
 
-def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[Array, " ray"]:
-    """The states after each unfinished ray has read one cell."""
+def step(pyramid: Pyramid, r: GridRays, state: Int32[Array, " ray"]) -> Int32[Array, " ray"]:
+    """The states after each ray has read one cell. Those of finished rays have no meaning."""
     height, width = pyramid.shapes[0]
-    x, y, level, left, up = unpack(state)
-    read_level = jnp.minimum(level, len(pyramid.shapes) - 1)
-    columns = jnp.asarray([shape[1] for shape in pyramid.shapes], jnp.int32)[read_level]
-    offset = jnp.asarray(pyramid.offsets, jnp.int32)[read_level]
-    cell_x, cell_y = x >> read_level, y >> read_level
-    index = offset + cell_y * columns + cell_x
-    nearest = pyramid.values.at[index].get(mode="promise_in_bounds")
+    x, y, level, to_left, to_up = unpack(state)
+    left, up = to_left == 1, to_up == 1
+    cell_x, cell_y = x >> level, y >> level
+    nearest = _cell_value(pyramid, cell_x, cell_y, level)
 
-    border_x, border_y = (cell_x + 1 - left) << read_level, (cell_y + 1 - up) << read_level
+    # The borders through which the ray leaves the cell, and the texels before and beyond them.
+    border_x = (cell_x + (1 - to_left)) << level
+    border_y = (cell_y + (1 - to_up)) << level
+    last_x, last_y = border_x - (1 - to_left), border_y - (1 - to_up)
+    beyond_x, beyond_y = border_x - to_left, border_y - to_up
     leave_x = crossing_moment(border_x, r.ox, r.ix, left)
     leave_y = crossing_moment(border_y, r.oy, r.iy, up)
-    leave = earlier(leave_x, leave_y)
+    crosses_x, crosses_y = ~is_earlier(leave_y, leave_x), ~is_earlier(leave_x, leave_y)
+    leave_time = jnp.minimum(leave_x.time, leave_y.time)
+    leave = Moment(leave_time, jnp.where(crosses_x, left, up))
     now = texel_entry(r, *axis_entries(r, x, y, left, up))
     # Without motion in z the time is -inf or NaN where the ray is behind the value, else +inf.
     reach_time = (nearest - r.oz) * r.iz
@@ -137,34 +136,40 @@ def step(pyramid: Pyramid, r: GridRays, state: UInt32[Array, " ray"]) -> UInt32[
     next_moment = Moment(jnp.where(reached, reach_time, leave.time), leave.after & ~reached)
     x_then = texel_at(next_moment, r.ox, r.dx, left)
     y_then = texel_at(next_moment, r.oy, r.dy, up)
-    x_inside = _clip_to_cell(x_then, x, cell_x, read_level, left)
-    y_inside = _clip_to_cell(y_then, y, cell_y, read_level, up)
-    crosses_x, crosses_y = ~is_earlier(leave_y, leave_x), ~is_earlier(leave_x, leave_y)
-    next_x = jnp.where(~reached & crosses_x, border_x - left, x_inside)
-    next_y = jnp.where(~reached & crosses_y, border_y - up, y_inside)
+    next_x = jnp.where(~reached & crosses_x, beyond_x, _between(x_then, x, last_x))
+    next_y = jnp.where(~reached & crosses_y, beyond_y, _between(y_then, y, last_y))
     stays = reached & ~is_ahead
     next_x, next_y = jnp.where(stays, x, next_x), jnp.where(stays, y, next_y)
     in_same_ancestor = ((next_x ^ x) | (next_y ^ y)) >> (level + _LEVEL_STRIDE) == 0
     level_beyond = jnp.where(in_same_ancestor, level, level + 1)
     next_level = jnp.where(reached, jnp.maximum(level - _LEVEL_STRIDE, 0), level_beyond)
 
-    is_hit = reached & (level == 0)
-    is_outside = (next_x < 0) | (next_x >= width) | (next_y < 0) | (next_y >= height)
+    next_level = jnp.where(reached & (level == 0), HIT, next_level)
+    is_outside = ((next_x | next_y) < 0) | (next_x >= width) | (next_y >= height)
     is_miss = is_outside | (~reached & (leave.time == jnp.inf))
-    next_level = jnp.where(is_hit, HIT, jnp.where(is_miss, MISS, next_level))
-    is_done = is_hit | is_miss
-    next_x, next_y = jnp.where(is_done, x, next_x), jnp.where(is_done, y, next_y)
-    return jnp.where(level >= MISS, state, pack(next_x, next_y, next_level, left, up))
+    next_state = pack(next_x, next_y, next_level, to_left, to_up)
+    return jnp.where(is_miss, _missed(state), next_state)
 
 
-def _clip_to_cell(
-    texel: Array, current: Array, cell: Array, level: Array, backward: Array
-) -> Array:
-    """The x or y of a texel, clipped to the part of a cell that the ray has not yet passed."""
-    first, last = cell << level, ((cell + 1) << level) - 1
-    low = jnp.where(backward == 1, first, current)
-    high = jnp.where(backward == 1, current, last)
-    return jnp.clip(texel, low, high)
+def _cell_value(pyramid: Pyramid, cell_x: Array, cell_y: Array, level: Array) -> Array:
+    """The values of cells; those of a ray that is done are of no use, but inside the array."""
+    of_level = np.full(2**_LEVEL_BITS, pyramid.offsets[-1], np.int32)
+    of_level[: len(pyramid.shapes)] = pyramid.offsets
+    read = lambda values, index: values.at[index].get(
+        mode="promise_in_bounds", wrap_negative_indices=False
+    )
+    columns = (pyramid.shapes[0][1] - 1 >> level) + 1
+    return read(pyramid.values, read(jnp.asarray(of_level), level) + cell_y * columns + cell_x)
+
+
+def _between(texel: Array, a: Array, b: Array) -> Array:
+    """A row or column, or the nearer of two others where it does not lie between them."""
+    return jnp.clip(texel, jnp.minimum(a, b), jnp.maximum(a, b))
+
+
+def _missed(state: Int32[Array, "..."]) -> Int32[Array, "..."]:
+    """The state of rays that were in this one, and meet nothing."""
+    return state & ~(2**_LEVEL_BITS - 1) | MISS
 
 
 def traverse(
@@ -211,11 +216,11 @@ def _first_states(pyramid: Pyramid, thickness: Array, r: GridRays):
     the farthest value (their difference is `thickness`): at most `_START_CELLS` cells. Any
     level gives the same hit; from the root it would take many more steps.
     """
-    left, up = backward_axes(r)
     x, y, inside = entry_texel(r, *pyramid.shapes[0])
     x, y = (jnp.where(inside, texel, 0) for texel in (x, y))
     root = jnp.full_like(x, len(pyramid.shapes) - 1)
-    state = step(pyramid, r, pack(x, y, jnp.where(inside, root, MISS), left, up))
+    state = pack(x, y, root, *map(as_int, backward_axes(r)))
+    state = jnp.where(inside, step(pyramid, r, state), _missed(state))
 
     x, y, level, left, up = unpack(state)
     texels = thickness * r.iz * jnp.maximum(jnp.abs(r.dx), jnp.abs(r.dy))
@@ -228,7 +233,7 @@ def _first_states(pyramid: Pyramid, thickness: Array, r: GridRays):
 def _texel_hits(pyramid: Pyramid, r: GridRays, state: Array, steps: Array) -> TexelHit:
     """When, and through which face, rays meet the texels of their final states."""
     x, y, level, left, up = unpack(state)
-    enter_x, enter_y = axis_entries(r, x, y, left, up)
+    enter_x, enter_y = axis_entries(r, x, y, left == 1, up == 1)
     entry_time = texel_entry(r, enter_x, enter_y).time
     texel = pyramid.values.at[y * pyramid.shapes[0][1] + x].get(mode="promise_in_bounds")
     reach_time = (texel - r.oz) * r.iz
@@ -273,7 +278,7 @@ def _step_packed(pyramid, r, state, steps, max_steps):
         ray = jnp.arange(count, dtype=jnp.int32)
         packed = jnp.full(packed_count, count, jnp.int32).at[slot].set(ray, mode="drop")
         take = lambda x: x.at[packed].get(mode="fill", fill_value=0)
-        rest = jnp.where(packed < count, take(state), jnp.uint32(MISS << _LEVEL_SHIFT))
+        rest = jnp.where(packed < count, take(state), jnp.int32(MISS))
         rest = _step_packed(pyramid, jax.tree.map(take, r), rest, take(steps), max_steps)
         state, steps = (
             x.at[packed].set(final, mode="drop")

@@ -16,7 +16,7 @@ def test_a_state_is_one_integer_that_keeps_all_five():
     most = (2**13, 2**13, 16, 2, 2)
     parts = [jnp.asarray(rng.integers(0, size, 500), jnp.int32) for size in most]
     state = pack(*parts)
-    assert state.dtype == jnp.uint32
+    assert state.dtype == jnp.int32
     for part, kept in zip(parts, unpack(state), strict=True):
         np.testing.assert_array_equal(kept, part)
     np.testing.assert_array_equal(level_of(state), parts[2])
