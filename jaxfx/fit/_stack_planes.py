@@ -6,6 +6,10 @@ transforms, and what is left over, in a window about a pixel, tells how well the
 The spectra of images fall as 1 / frequency. So what is left over is led by low frequencies,
 where the blur of nearer surfaces lies; times the frequency it is led by high ones, where noise
 and aliasing lie. A plane is judged by both at once.
+
+Where a plane is blurred, an image shows less of it, and more of what is near or behind. So an
+image counts less the larger its circle of confusion is. One that is in focus beyond the plane
+counts least: it shows what a thin surface there does not hide.
 """
 
 import functools
@@ -28,6 +32,10 @@ WINDOW = 1.5
 _BLOCK = 5
 # Noise that is always allowed for, as a ratio to the images' root mean square.
 _LEAST_NOISE = 1e-3
+# Circle of confusion in pixels from which on an image counts less under a plane: where it is in
+# focus beyond the plane, and where before it. With a smaller first one the surfaces behind lose
+# what is beside a near one, with a larger one thin near surfaces are missed.
+_BEYOND, _BEFORE = 8.0, 16.0
 # Power of the noise over that of the image in the quotient, a ratio. Larger blurs the image,
 # smaller lets the errors of one surface ring over others.
 _NOISE = 1e-2
@@ -49,7 +57,8 @@ class Planes(NamedTuple):
     """Residual, slope and image per pixel under each candidate plane, planes first.
 
     - `energy`: geometric mean of two sums in the window, of squared residuals and of squared
-      residuals times frequency, squared units of radiance. White noise has as much of both.
+      residuals times frequency, squared units of radiance. White noise has as much of both. As
+      a ratio to what unrelated images would leave, times that of one image.
     - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
     - `spread`: variance of the sum of residuals times derivatives.
     - `image`: the all-in-focus image if all were on the plane.
@@ -83,28 +92,36 @@ def compared(
     frequency = jnp.asarray(frequency, dtype)
     # The mean square frequency of an image is 1 / 6: white noise keeps its power.
     rise = (math.sqrt(6) * frequency)[..., None].astype(spectra.dtype)
+    # The power of unrelated images; times the square of `rise` it is even.
+    pink = jnp.where(frequency > 0, 1 / jnp.where(frequency > 0, frequency, 1) ** 2, 0)
 
     def image_of(spectrum: Array) -> Array:
         size, axes = (rows, columns), (-3, -2)
         whole = jnp.fft.irfft2(spectrum, s=size, axes=axes)
         return whole[..., pad : pad + height, pad : pad + width, :].astype(dtype)
 
+    def seen(inverse_depth: Array) -> tuple[Array, Array]:
+        """The root of each image's weight, and the transform of its disc times that root."""
+        defocus = strengths * (foci - inverse_depth)
+        reach = jnp.where(defocus < 0, _BEYOND, _BEFORE).astype(dtype)
+        weights = 1 / (1 + jax.lax.stop_gradient(defocus / reach) ** 2)
+        roots = jnp.sqrt(weights / jnp.max(weights))[:, None, None]
+        return roots, roots * jax.vmap(lambda c: disc(c * frequency))(jnp.abs(defocus))
+
     def fitted(inverse_depth: Array) -> tuple[Array, Array, Array]:
-        circles = jnp.abs(strengths * (foci - inverse_depth))
-        blurs = jax.vmap(lambda c: disc(c * frequency))(circles)[..., None]
+        roots, blurs = (x[..., None] for x in seen(inverse_depth))
         quotients = blurs / (jnp.sum(blurs * blurs, axis=0) + _NOISE)[None]
-        blurs, quotients = (x.astype(spectra.dtype) for x in (blurs, quotients))
-        sharp = jnp.sum(quotients * spectra, axis=0)
-        left = spectra - blurs * sharp[None]
+        roots, blurs, quotients = (x.astype(spectra.dtype) for x in (roots, blurs, quotients))
+        sharp = jnp.sum(quotients * roots * spectra, axis=0)
+        left = roots * spectra - blurs * sharp[None]
         return image_of(left), image_of(rise[None] * left), image_of(sharp)
 
     def projector(inverse_depth: Array) -> Array:
         """The matrix, at each frequency, from images to residuals under one plane."""
-        circles = jnp.abs(strengths * (foci - inverse_depth))
-        blurs = jax.vmap(lambda c: disc(c * frequency))(circles)
+        roots, blurs = seen(inverse_depth)
         power = jnp.sum(blurs * blurs, axis=0) + _NOISE
-        one = jnp.eye(len(circles), dtype=dtype)[..., None, None]
-        return one - blurs[:, None] * blurs[None] / power[None, None]
+        one = jnp.eye(len(foci), dtype=dtype)[..., None, None]
+        return roots[:, None] * one - blurs[:, None] * (roots * blurs)[None] / power[None, None]
 
     floor = _LEAST_NOISE**2 * jnp.mean(images * images)
 
@@ -115,12 +132,15 @@ def compared(
         # Noise alone has slopes too: as much, for the residuals that it leaves, as white noise.
         left, turned = jax.jvp(projector, (inverse_depth,), (one,))
         white = jnp.sum(turned * turned) / jnp.sum(left * left)
+        unrelated = jnp.sum(left * left, axis=(0, 1))
+        share = jnp.mean(unrelated) * jnp.sum(pink * unrelated) / jnp.sum(pink)
         plain, risen = (windowed(jnp.sum(x * x, axis=over)) for x in (residual, fine))
         steepness = jnp.sum(slope * slope, axis=over)
         score = _boxed(jnp.sum(residual * slope, axis=over)) / _BLOCK
         spread = windowed(score * score + floor * steepness)
         told = jnp.maximum(windowed(steepness) - white * plain, 0)
-        return carry, Planes(jnp.sqrt(plain) * jnp.sqrt(risen), told, spread, sharp)
+        energy = jnp.sqrt(plain) * jnp.sqrt(risen) / jnp.sqrt(share)
+        return carry, Planes(energy, told, spread, sharp)
 
     return scan(plane, None, candidates)[1]
 

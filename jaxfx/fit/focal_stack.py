@@ -46,6 +46,9 @@ from jaxfx.lens import ThinLens
 # variation from image to image that is explained; the largest difference in exposure. Looser
 # bounds trust stacks that show nothing, tighter ones doubt those of which half is even.
 _MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.5, 0.05
+# Ratio of energies: up to this one the images agree with what is filled as with what was found.
+# A smaller one leaves noise where nothing is told, a larger one fills thin surfaces up.
+_AGREES = 1.25
 # Pixels of defocus from one candidate plane to the next. Coarser planes miss the least energy,
 # finer ones cost time alone.
 _STEP = 0.35
@@ -162,15 +165,18 @@ def focal_stack(
     First candidate planes are compared, a third of a pixel of defocus apart. For each the image
     that explains the stack best is a quotient of Fourier transforms, and the plane whose
     residuals in a window are least, plain and with high frequencies raised, gives a pixel its
-    depth. Then each takes the median about it, weighted by the planes' agreement with the
-    images and by likeness of color; where nothing near is determined it is filled as by
-    `depth.fill`. From there image and depth are searched for together, by nonlinear conjugate
-    gradients through the effect, with a pseudo-Huber loss, in which an image counts less where
-    its circle of confusion is above 2 pixels, and a prior of the same form on second
-    differences of the inverse depth, which is less at edges of the image. More steps than the
-    default lower the error of depth where little is hidden, and let the image follow what the
-    effect draws wrong. The standard error is that of Gauss and Newton, with the image solved
-    for, from derivatives of the residuals in the window and the residuals themselves.
+    depth. An image counts less the larger its circle of confusion would be there, least one
+    that is in focus beyond the plane: it shows what a thin surface does not hide. Then each
+    takes the median about it, weighted by the planes' agreement with the images and by
+    likeness of color; where nothing near is determined it is filled as by `depth.fill`, unless
+    the images contradict that. From there image and depth are searched for together, by
+    nonlinear conjugate gradients through the effect, with a pseudo-Huber loss, in which an
+    image counts less where its circle of confusion is above 2 pixels, and a prior of the same
+    form on second differences of the inverse depth, which is less at edges of the image. More
+    steps than the default lower the error of depth where little is hidden, and let the image
+    follow what the effect draws wrong. The standard error is that of Gauss and Newton, with the
+    image solved for, from derivatives of the residuals in the window and the residuals
+    themselves.
 
     Known limits: within the radius of a circle of confusion from an edge in depth, a window
     shows two surfaces. Where all circles are below some 4 pixels the depth is biased, by 5 % in
@@ -178,8 +184,8 @@ def focal_stack(
 
     Source: Zhou, Lin & Nayar 2009, the comparison of planes by Wiener quotients; Newey & West
     1987, variances of sums whose terms depend on their neighbors. The raised
-    frequencies, the weighted median's trust, the search through the effect, its weights and
-    prior, and the bounds of success are ours.
+    frequencies, the images' weights, the weighted median's trust, the search through the
+    effect, its weights and prior, and the bounds of success are ours.
     """
     stack, lenses = _checked(images, lenses)
     option("focal_stack(effect=...)", effect, get_args(Effect))
@@ -207,7 +213,7 @@ def focal_stack(
         tiny = jnp.finfo(dtype).tiny
         guide = image / jnp.maximum(jnp.sqrt(jnp.mean(image * image)), tiny)
         start = settled(start, energy, guide)
-        start = _filled(start, _errors(planes, candidates, start), stack)
+        start = _filled(start, planes, candidates, stack)
         residual = _residual(
             stack, lenses, image, energy, candidates, start, smoothness, effect
         )
@@ -323,14 +329,21 @@ def _errors(planes: Planes, candidates: Array, inverse_depth: Array) -> Array:
     return jnp.where(is_told, jnp.sqrt(spread) / jnp.where(is_told, slope, 1), jnp.inf)
 
 
-def _filled(inverse_depth: Array, error: Array, stack: Array) -> Array:
-    """The inverse depth, filled where no pixel within the median's reach is determined."""
-    is_known = around(error < _MOST_ERROR * inverse_depth)
+def _filled(inverse_depth: Array, planes: Planes, candidates: Array, stack: Array) -> Array:
+    """The inverse depth, filled where no pixel within the median's reach is determined.
+
+    A value that the images contradict is not filled in. Beside a thin surface no plane explains
+    them, so that nothing is determined there, but they still tell near from far.
+    """
+    is_known = around(_errors(planes, candidates, inverse_depth) < _MOST_ERROR * inverse_depth)
     if not bool(is_known.any()):
         return inverse_depth
     guide = jnp.mean(stack, axis=0)
     guide = guide / jnp.maximum(jnp.max(guide), jnp.finfo(guide.dtype).tiny)
-    return 1 / depths.fill(jnp.where(is_known, 1 / inverse_depth, 0), guide).depth
+    filled = 1 / depths.fill(jnp.where(is_known, 1 / inverse_depth, 0), guide).depth
+    energy = lambda at: at_inverse_depth(planes.energy, candidates, at)
+    agrees = energy(filled) <= _AGREES * energy(inverse_depth)
+    return jnp.where(agrees, filled, inverse_depth)
 
 
 def _residual(
@@ -346,7 +359,7 @@ def _residual(
     """The residual of the search, which starts at the planes' image and inverse depth."""
     dtype = stack.dtype
     level = jnp.sqrt(jnp.mean(stack * stack))
-    area = 2 * math.pi * WINDOW**2 * len(stack) * stack.shape[-1]
+    area = 2 * math.pi * WINDOW**2 * stack.shape[-1]
     noise = jnp.sqrt(jnp.median(energy) / area) + 1e-3 * level
     strengths, foci = _lines(lenses)
     largest = _largest(strengths, foci, float(candidates[0]), float(candidates[-1]))

@@ -30,7 +30,7 @@ def texture(size=SIZE, seed=0, channels=1):
 
 def through(image, depth, lens):
     """A periodic wall through a lens: the transform of the disc in closed form, by Bessel."""
-    circle = 0.2 * 80 * abs(1 / float(lens.focus_distance) - 1 / depth)
+    circle = float(lens.circle_of_confusion(depth))
     rho = np.hypot(*np.meshgrid(np.fft.fftfreq(image.shape[1]), np.fft.fftfreq(image.shape[0])))
     x = np.pi * np.maximum(circle * rho, 1e-9)
     spectrum = np.fft.fft2(image, axes=(0, 1)) * (2 * j1(x) / x)[..., None]
@@ -63,6 +63,25 @@ def test_a_textured_wall(depth):
     assert np.sqrt(np.mean((np.asarray(found.image) - image)[middle] ** 2)) < 0.02
     error = np.asarray(found.standard_errors["depth"])[middle]
     assert np.mean(off * depth < 1.96 * error) > 0.9
+
+
+@pytest.mark.parametrize(("strength", "width"), [(16, 2), (45, 3)])
+def test_a_thin_near_pole_is_told_from_the_wall_behind_it(strength, width):
+    """Images that are in focus on the wall show it through the pole."""
+    size = 48
+    row, column = np.mgrid[:size, :size]
+    pole = (np.abs(column - 0.1 * row - 21.1) < width / 2)[..., None].astype(float)
+    wall, stripes = texture(size, 0, 3), texture(size, 100, 3) * [1, 0.3, 0.3] + [0.3, 0, 0]
+    lenses = [ThinLens(strength / 80, focus, 80.0) for focus in FOCI]
+    images = [
+        through(pole * stripes, 1.5, lens)
+        + (1 - through(pole, 1.5, lens)) * through(wall, 4.5, lens)
+        for lens in lenses
+    ]
+    found = fit.focal_stack(images, lenses, min_depth=1.2, max_depth=6.0, **QUICK)
+    true_depth, is_pole = np.where(pole[..., 0] > 0, 1.5, 4.5), pole[..., 0] > 0
+    is_right = strength * np.abs(1 / np.asarray(found.depth) - 1 / true_depth) < 1
+    assert is_right[is_pole].mean() > 0.95 and is_right[~is_pole].mean() > 0.95
 
 
 def test_where_there_is_no_texture_nothing_is_told():
