@@ -121,6 +121,7 @@ def step(pyramid: Pyramid, r: GridRays, state: Int32[Array, " ray"]) -> Int32[Ar
     leave_y = crossing_moment(border_y, r.oy, r.iy, up)
     crosses_x, crosses_y = ~is_earlier(leave_y, leave_x), ~is_earlier(leave_x, leave_y)
     leave_time = jnp.minimum(leave_x.time, leave_y.time)
+    # Where both are crossed at one moment, both flags are alike.
     leave = Moment(leave_time, jnp.where(crosses_x, left, up))
     now = texel_entry(r, *axis_entries(r, x, y, left, up))
     # Without motion in z the time is -inf or NaN where the ray is behind the value, else +inf.
