@@ -57,8 +57,9 @@ class Planes(NamedTuple):
     """Residual, slope and image per pixel under each candidate plane, planes first.
 
     - `energy`: geometric mean of two sums in the window, of squared residuals and of squared
-      residuals times frequency, squared units of radiance. White noise has as much of both. As
-      a ratio to what unrelated images would leave, times that of one image.
+      residuals times frequency, squared units of radiance. White noise has as much of both. It
+      is divided by what unrelated images of unit power would leave, so that planes under which
+      few images count can be compared with others.
     - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
     - `spread`: variance of the sum of residuals times derivatives.
     - `image`: the all-in-focus image if all were on the plane.
@@ -132,6 +133,7 @@ def compared(
         # Noise alone has slopes too: as much, for the residuals that it leaves, as white noise.
         left, turned = jax.jvp(projector, (inverse_depth,), (one,))
         white = jnp.sum(turned * turned) / jnp.sum(left * left)
+        # What unrelated images would leave: in the plain sum and in that of high frequencies.
         unrelated = jnp.sum(left * left, axis=(0, 1))
         share = jnp.mean(unrelated) * jnp.sum(pink * unrelated) / jnp.sum(pink)
         plain, risen = (windowed(jnp.sum(x * x, axis=over)) for x in (residual, fine))

@@ -48,7 +48,7 @@ from jaxfx.lens import ThinLens
 _MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.5, 0.05
 # Ratio of energies: up to this one the images agree with what is filled as with what was found.
 # A smaller one leaves noise where nothing is told, a larger one fills thin surfaces up.
-_AGREES = 1.25
+_MOST_ENERGY_RATIO = 1.25
 # Pixels of defocus from one candidate plane to the next. Coarser planes miss the least energy,
 # finer ones cost time alone.
 _STEP = 0.35
@@ -342,7 +342,7 @@ def _filled(inverse_depth: Array, planes: Planes, candidates: Array, stack: Arra
     guide = guide / jnp.maximum(jnp.max(guide), jnp.finfo(guide.dtype).tiny)
     filled = 1 / depths.fill(jnp.where(is_known, 1 / inverse_depth, 0), guide).depth
     energy = lambda at: at_inverse_depth(planes.energy, candidates, at)
-    agrees = energy(filled) <= _AGREES * energy(inverse_depth)
+    agrees = energy(filled) <= _MOST_ENERGY_RATIO * energy(inverse_depth)
     return jnp.where(agrees, filled, inverse_depth)
 
 

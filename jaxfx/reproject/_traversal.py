@@ -83,7 +83,8 @@ def pack(x: Array, y: Array, level: Array, left: Array, up: Array) -> Int32[Arra
     """The state of rays in texel (x, y). From the lowest bit: level, x, y, left, up.
 
     `left` and `up` are 1 for a ray that runs towards smaller x and towards smaller y, else 0.
-    They follow from the ray, but XLA would compute them once, and read them in every step.
+    They follow from the ray's direction. If they were not in the state, XLA would compute them
+    once for all steps, and each step would read them as further arrays.
     """
     bits = up << 1 | left
     for size, value in ((_TEXEL_BITS, y), (_TEXEL_BITS, x), (_LEVEL_BITS, level)):
@@ -105,25 +106,25 @@ def level_of(state: Int32[Array, "..."]) -> Int32[Array, "..."]:
 
 
 def step(pyramid: Pyramid, r: GridRays, state: Int32[Array, " ray"]) -> Int32[Array, " ray"]:
-    """The states after each ray has read one cell. Those of finished rays have no meaning."""
+    """The states after each ray has read one cell; of no use for rays that are done."""
     height, width = pyramid.shapes[0]
-    x, y, level, to_left, to_up = unpack(state)
-    left, up = to_left == 1, to_up == 1
+    x, y, level, left, up = unpack(state)
+    runs_left, runs_up = left == 1, up == 1
     cell_x, cell_y = x >> level, y >> level
     nearest = _cell_value(pyramid, cell_x, cell_y, level)
 
     # The borders through which the ray leaves the cell, and the texels before and beyond them.
-    border_x = (cell_x + (1 - to_left)) << level
-    border_y = (cell_y + (1 - to_up)) << level
-    last_x, last_y = border_x - (1 - to_left), border_y - (1 - to_up)
-    beyond_x, beyond_y = border_x - to_left, border_y - to_up
-    leave_x = crossing_moment(border_x, r.ox, r.ix, left)
-    leave_y = crossing_moment(border_y, r.oy, r.iy, up)
+    border_x = (cell_x + (1 - left)) << level
+    border_y = (cell_y + (1 - up)) << level
+    last_x, last_y = border_x - (1 - left), border_y - (1 - up)
+    beyond_x, beyond_y = border_x - left, border_y - up
+    leave_x = crossing_moment(border_x, r.ox, r.ix, runs_left)
+    leave_y = crossing_moment(border_y, r.oy, r.iy, runs_up)
     crosses_x, crosses_y = ~is_earlier(leave_y, leave_x), ~is_earlier(leave_x, leave_y)
     leave_time = jnp.minimum(leave_x.time, leave_y.time)
     # Where both are crossed at one moment, both flags are alike.
-    leave = Moment(leave_time, jnp.where(crosses_x, left, up))
-    now = texel_entry(r, *axis_entries(r, x, y, left, up))
+    leave = Moment(leave_time, jnp.where(crosses_x, runs_left, runs_up))
+    now = texel_entry(r, *axis_entries(r, x, y, runs_left, runs_up))
     # Without motion in z the time is -inf or NaN where the ray is behind the value, else +inf.
     reach_time = (nearest - r.oz) * r.iz
     recedes = r.iz > 0
@@ -135,8 +136,8 @@ def step(pyramid: Pyramid, r: GridRays, state: Int32[Array, " ray"]) -> Int32[Ar
 
     # The next texel: where the ray reaches the value, or beyond the border of the cell.
     next_moment = Moment(jnp.where(reached, reach_time, leave.time), leave.after & ~reached)
-    x_then = texel_at(next_moment, r.ox, r.dx, left)
-    y_then = texel_at(next_moment, r.oy, r.dy, up)
+    x_then = texel_at(next_moment, r.ox, r.dx, runs_left)
+    y_then = texel_at(next_moment, r.oy, r.dy, runs_up)
     next_x = jnp.where(~reached & crosses_x, beyond_x, _between(x_then, x, last_x))
     next_y = jnp.where(~reached & crosses_y, beyond_y, _between(y_then, y, last_y))
     stays = reached & ~is_ahead
@@ -148,12 +149,16 @@ def step(pyramid: Pyramid, r: GridRays, state: Int32[Array, " ray"]) -> Int32[Ar
     next_level = jnp.where(reached & (level == 0), HIT, next_level)
     is_outside = ((next_x | next_y) < 0) | (next_x >= width) | (next_y >= height)
     is_miss = is_outside | (~reached & (leave.time == jnp.inf))
-    next_state = pack(next_x, next_y, next_level, to_left, to_up)
+    next_state = pack(next_x, next_y, next_level, left, up)
     return jnp.where(is_miss, _missed(state), next_state)
 
 
 def _cell_value(pyramid: Pyramid, cell_x: Array, cell_y: Array, level: Array) -> Array:
-    """The values of cells; those of a ray that is done are of no use, but inside the array."""
+    """The values of cells of any level.
+
+    A state that is done has a level above the last one. It reads the last one, which is of no
+    use to it, but inside the array.
+    """
     of_level = np.full(2**_LEVEL_BITS, pyramid.offsets[-1], np.int32)
     of_level[: len(pyramid.shapes)] = pyramid.offsets
     read = lambda values, index: values.at[index].get(

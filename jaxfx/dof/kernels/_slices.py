@@ -104,7 +104,7 @@ def across_of(reach: int) -> int:
 
 
 def _planes_of(sheets: Sheets) -> list[Float[Array, "sheet plane height width"]]:
-    """What discs have, in the order of the rows of `Grid.discs`: value, radius, tilt, place."""
+    """The planes of value, radius, tilt and place, in the order of the rows of `Grid.discs`."""
     value, radius, tilt, place = sheets
     return [value, radius[:, None], tilt, place[:, None]]
 
