@@ -76,7 +76,11 @@ def _to_jax(array: Any, dtype: Any = None) -> Array:
     if not is_concrete(array):
         return jnp.asarray(array, dtype)
     with jax.ensure_compile_time_eval():
-        return jnp.asarray(array, dtype)
+        if isinstance(array, jax.Array):
+            return jnp.asarray(array, dtype)
+        # As `jnp.asarray` does, but without a program for every shape. On a CPU the device may
+        # share the memory of a NumPy array, which its owner may write to: hence a copy.
+        return jax.device_put(np.array(array, dtype))
 
 
 def as_numpy(name: str, value: Any) -> np.ndarray:

@@ -4,22 +4,31 @@ Pixel (row j, column i) covers [i, i + 1) x [j, j + 1); its centre is (i + 0.5, 
 coordinates are always (x, y).
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Shaped
+
+from jaxfx._numerics import one_program
 
 
 def pixel_centers(
     height: int, width: int, dtype: DTypeLike | None = None
 ) -> Float[Array, "height width 2"]:
     """The coordinates (x, y) of every pixel's centre."""
-    dtype = jnp.result_type(float) if dtype is None else dtype
+    return _pixel_centers(height, width, jnp.result_type(float) if dtype is None else dtype)
+
+
+@functools.partial(one_program, static_argnums=(0, 1, 2))
+def _pixel_centers(height: int, width: int, dtype: DTypeLike) -> Float[Array, "height width 2"]:
     x = jnp.arange(width, dtype=dtype) + 0.5
     y = jnp.arange(height, dtype=dtype) + 0.5
     return jnp.stack(jnp.meshgrid(x, y), axis=-1)
 
 
+@one_program
 def nearest(
     image: Shaped[Array, "height width ..."], points: Float[Array, "*batch 2"]
 ) -> Shaped[Array, "..."]:
@@ -29,6 +38,7 @@ def nearest(
     return image[y, x]
 
 
+@one_program
 def bilinear(
     image: Float[Array, "height width ..."], points: Float[Array, "*batch 2"]
 ) -> Float[Array, "..."]:

@@ -14,6 +14,7 @@ height width, scene units along the optical axis. `fill(method="rows")` is a bas
 comparison.
 """
 
+import functools
 from typing import Any, Literal, final
 
 import equinox as eqx
@@ -24,10 +25,10 @@ from jaxtyping import Array, Bool, Float, Num
 
 from jaxfx._arguments import check_camera
 from jaxfx._arrays import ArrayLike
-from jaxfx._checks import as_numpy, check, check_image, is_concrete, parameter
+from jaxfx._checks import as_array, as_numpy, check, check_image, is_concrete, parameter
 from jaxfx._holes import cheapest_sources, farther_ends
 from jaxfx._meshes import on_any_mesh
-from jaxfx._numerics import inverse, working_dtype
+from jaxfx._numerics import inverse, one_program, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import OrthographicCamera, PinholeCamera
 
@@ -76,9 +77,7 @@ def clean(
     unit = parameter("clean(unit=...)", unit)
     check("clean(unit=...)", unit, lambda v: (v > 0) & np.isfinite(v), "positive and finite")
     values, is_background = _numbers_and_sky("clean(depth)", depth, sky)
-    is_known = (values > 0) & ~is_background
-    safe_depth = jnp.where(is_known, values, 1) * unit.astype(values.dtype)
-    return _with_holes(safe_depth, is_known, is_background)
+    return _scaled(values, is_background, unit)
 
 
 @on_any_mesh
@@ -117,9 +116,15 @@ def from_disparity(
     Source: Ranftl et al. 2020, disparity up to scale and shift.
     """
     values, _ = _numbers("from_disparity(disparity)", disparity)
-    scale = parameter("from_disparity(scale=...)", scale).astype(values.dtype)
-    shift = parameter("from_disparity(shift=...)", shift).astype(values.dtype)
+    scale = parameter("from_disparity(scale=...)", scale)
+    shift = parameter("from_disparity(shift=...)", shift)
+    return _from_disparity(values, scale, shift)
+
+
+@one_program
+def _from_disparity(values, scale, shift):
     is_number = jnp.isfinite(values)
+    scale, shift = scale.astype(values.dtype), shift.astype(values.dtype)
     inverse_depth = jnp.where(is_number, values, 1) * scale + shift
     is_known = is_number & (inverse_depth > 0) & jnp.isfinite(inverse_depth)
     safe_depth = 1 / jnp.where(is_known, inverse_depth, 1)
@@ -170,11 +175,14 @@ def from_stereo(
     base = parameter("from_stereo(baseline=...)", baseline)
     check("from_stereo(focal_pixels=...)", focal, lambda v: v > 0, "positive")
     check("from_stereo(baseline=...)", base, lambda v: v > 0, "positive")
-    disparity_offset = parameter("from_stereo(disparity_offset=...)", disparity_offset).astype(
-        values.dtype
-    )
+    offset = parameter("from_stereo(disparity_offset=...)", disparity_offset)
+    return _from_stereo(values, focal, base, offset)
+
+
+@one_program
+def _from_stereo(values, focal, base, offset):
     is_match = jnp.isfinite(values) & (values > 0)
-    shifted = jnp.where(is_match, values, 1) + disparity_offset
+    shifted = jnp.where(is_match, values, 1) + offset.astype(values.dtype)
     is_known = is_match & (shifted > 0)
     product = focal.astype(values.dtype) * base.astype(values.dtype)
     safe_depth = product / jnp.where(is_known, shifted, 1)
@@ -214,13 +222,12 @@ def from_ray_distance(
     """
     check_camera("from_ray_distance(camera)", camera)
     values, is_background = _numbers_and_sky("from_ray_distance(distance)", distance, None)
-    is_known = (values > 0) & ~is_background
-    safe_depth = jnp.where(is_known, values, 1)
-    if isinstance(camera, PinholeCamera):
-        safe_depth = safe_depth * _axis_per_ray(camera, values)
-    return _with_holes(safe_depth, is_known, is_background)
+    is_pinhole = isinstance(camera, PinholeCamera)
+    factor = _axis_per_ray(camera, values) if is_pinhole else jnp.ones((), values.dtype)
+    return _scaled(values, is_background, factor)
 
 
+@one_program
 def _axis_per_ray(
     camera: PinholeCamera, like: Float[Array, "height width"]
 ) -> Float[Array, "height width"]:
@@ -295,7 +302,7 @@ def fill(
     the guess for what is hidden: Hirschmüller 2008.
     """
     values, is_background = _numbers_and_sky("fill(depth)", depth, None)
-    values = _with_holes(values, (values > 0) & ~is_background, is_background)
+    values = _scaled(values, is_background, jnp.ones((), values.dtype))
     is_missing = jnp.isnan(values)
     if method not in ("guided", "rows"):
         raise ValueError(f'`fill(method=...)` must be "guided" or "rows", got {method!r}.')
@@ -336,7 +343,7 @@ def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool
     # JAX's own type for it: to ask for float64 by name, where it is off, would warn.
     of_jax = jax.dtypes.canonicalize_dtype(float if is_integer else array.dtype)
     dtype = of_jax if is_integer else working_dtype(of_jax)
-    array = jnp.asarray(array.astype(dtype))
+    array = as_array(name, array.astype(dtype))
     if is_masked:
         array = jnp.where(np.ma.getmaskarray(values), jnp.nan, array)
     return array, is_integer
@@ -349,12 +356,29 @@ def _numbers_and_sky(
     numbers, is_integer = _numbers(name, values)
     if sky is None:
         sky = () if is_integer else SKY
+    return numbers, _is_sky(numbers, tuple(sky))
+
+
+@functools.partial(one_program, static_argnums=1)
+def _is_sky(numbers, sky):
     is_background = jnp.isinf(numbers) & (numbers > 0)
     for mark in sky:
         is_background |= numbers == jnp.asarray(mark, numbers.dtype)
     if sky:
         is_background |= numbers >= jnp.asarray(max(sky), numbers.dtype)
-    return numbers, is_background
+    return is_background
+
+
+@one_program
+def _scaled(
+    values: Float[Array, "height width"],
+    is_background: Bool[Array, "height width"],
+    factor: Float[Array, "..."],
+) -> Float[Array, "height width"]:
+    """The values that are depths, times a factor; inf for background, NaN elsewhere."""
+    is_known = (values > 0) & ~is_background
+    safe_depth = jnp.where(is_known, values, 1) * factor.astype(values.dtype)
+    return _with_holes(safe_depth, is_known, is_background)
 
 
 def _with_holes(

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxfx._checks import as_array, parameter, share
+from jaxfx._numerics import one_program
 
 
 __all__ = ["GBuffer"]
@@ -135,15 +136,26 @@ class GBuffer(eqx.Module):
         depth = parameter(f"{name}(depth)", depth, color.shape[:2])
         metal = share(f"{name}(metallic)", metallic, color.shape[:2])
         roughness = share(f"{name}(roughness)", roughness, color.shape[:2])
-        metal = metal.astype(color.dtype)[..., None]
-        is_surface = (depth > 0) & (depth < jnp.inf)
+        shader, diffuse, specular = _of_metal(color, metal, depth)
         return cls(
             color=color,
-            shader=jnp.where(is_surface, 3, -1).astype(jnp.int32),
+            shader=shader,
             ambient=color,
-            diffuse=color * (1 - metal),
-            specular=DIELECTRIC * (1 - metal) + color * metal,
+            diffuse=diffuse,
+            specular=specular,
             normal=normal,
             depth=depth,
             roughness=roughness,
         )
+
+
+@one_program
+def _of_metal(
+    color: Float[Array, "height width 3"],
+    metal: Float[Array, "height width"],
+    depth: Float[Array, "height width"],
+) -> tuple[Array, Array, Array]:
+    """The shader, the diffuse and the specular reflectance of metallic-roughness materials."""
+    metal = metal.astype(color.dtype)[..., None]
+    shader = jnp.where((depth > 0) & (depth < jnp.inf), 3, -1).astype(jnp.int32)
+    return shader, color * (1 - metal), DIELECTRIC * (1 - metal) + color * metal

@@ -27,7 +27,7 @@ from jaxfx._checks import (
     whole_number,
     with_numbers,
 )
-from jaxfx._numerics import absolute, clip01, working_dtype
+from jaxfx._numerics import absolute, clip01, one_program, working_dtype
 from jaxfx.camera import PinholeCamera
 
 
@@ -105,12 +105,24 @@ def _finite(name: str, value: Any, valid: Any, expected: str) -> Float[Array, ""
     return number
 
 
-def _measured(lens: Any, method: str, depth: Any, measure: Any) -> Array:
-    """A lens' factor times a measure of the depth's, in the type of the depth."""
+def _checked(lens: Any, method: str, depth: Any) -> Array:
+    """The depth as an array, in its own float type, for a method of one of the lenses here."""
     check_fields(f"{type(lens).__name__}.{method}", lens)
-    depth = parameter(f"{method}(depth)", depth, None)
+    return parameter(f"{method}(depth)", depth, None)
+
+
+@one_program
+def _defocus(lens: Any, depth: Array) -> Array:
+    """A lens' factor of the defocus times the depth's."""
     scale, factor = lens._factors(depth.astype(working_dtype(depth.dtype)))
-    return (scale * measure(factor)).astype(depth.dtype)
+    return (scale * factor).astype(depth.dtype)
+
+
+@one_program
+def _circle_of_confusion(lens: Any, depth: Array) -> Array:
+    """A lens' factor of the defocus times the size of the depth's."""
+    scale, factor = lens._factors(depth.astype(working_dtype(depth.dtype)))
+    return (scale * absolute(factor)).astype(depth.dtype)
 
 
 @final
@@ -410,7 +422,7 @@ class ThinLens(eqx.Module):
 
         **Gradient:** exact; not finite at depth 0.
         """
-        return _measured(self, "defocus", depth, lambda factor: factor)
+        return _defocus(self, _checked(self, "defocus", depth))
 
     def circle_of_confusion(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Diameter of the circle of confusion: `|defocus(depth)|`.
@@ -423,7 +435,7 @@ class ThinLens(eqx.Module):
 
         **Gradient:** exact; on the focus plane, a kink, the one from behind it.
         """
-        return _measured(self, "circle_of_confusion", depth, absolute)
+        return _circle_of_confusion(self, _checked(self, "circle_of_confusion", depth))
 
 
 @final
@@ -507,7 +519,7 @@ class FocusPlanes(eqx.Module):
 
         **Gradient:** exact, with zero where clamped.
         """
-        return _measured(self, "defocus", depth, lambda ramp: ramp)
+        return _defocus(self, _checked(self, "defocus", depth))
 
     def circle_of_confusion(self, depth: _Depths) -> Float[Array, "*shape"]:
         """Diameter of the circle of confusion: `|defocus(depth)|`.
@@ -520,4 +532,4 @@ class FocusPlanes(eqx.Module):
 
         **Gradient:** exact; on the focus plane, a kink, the one from behind it.
         """
-        return _measured(self, "circle_of_confusion", depth, absolute)
+        return _circle_of_confusion(self, _checked(self, "circle_of_confusion", depth))

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import as_array, check, check_image, is_concrete, option, parameter
 from jaxfx._meshes import on_any_mesh
-from jaxfx._numerics import working_dtype
+from jaxfx._numerics import one_program, working_dtype
 
 
 __all__ = ["psnr", "ssim"]
@@ -80,17 +80,23 @@ def psnr(
     20.0
     """
     image, reference, data_range = _pair("psnr", image, reference, data_range)
-    error = image - reference
-    count = np.prod(error.shape)
     if mask is not None:
         mask = as_array("psnr(mask=...)", mask)
-        if mask.shape != error.shape[:2] or mask.dtype != jnp.bool_:
+        if mask.shape != image.shape[:2] or mask.dtype != jnp.bool_:
             raise ValueError(
-                f"`psnr(mask=...)` must hold booleans of shape {error.shape[:2]}, "
+                f"`psnr(mask=...)` must hold booleans of shape {image.shape[:2]}, "
                 f"got {mask.dtype} of shape {mask.shape}."
             )
         if is_concrete(mask) and not np.any(np.asarray(mask)):
             raise ValueError("`psnr(mask=...)` must have a true pixel, got none.")
+    return _psnr(image, reference, data_range, mask)
+
+
+@one_program
+def _psnr(image, reference, data_range, mask):
+    error = image - reference
+    count = np.prod(error.shape)
+    if mask is not None:
         error = jnp.where(mask[:, :, None], error, 0)
         count = jnp.sum(mask) * error.shape[2]
     mean = jnp.sum(error * error) / jnp.asarray(count, error.dtype)

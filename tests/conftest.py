@@ -15,7 +15,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 gc.set_threshold(100_000, 20, 20)
 
 # Every compiled program holds memory maps, of which Linux gives a process 65,530.
-MANY_MAPS = 20_000
+MANY_MAPS = 40_000
 
 # Whole folders that only `--full` runs; single tests carry the marker `full`.
 FULL_FOLDERS = {"accelerator", "examples", "stability"}

@@ -1,5 +1,6 @@
 """The floor: finite gradients where the plain formula has none."""
 
+import functools
 import inspect
 
 import hypothesis as hyp
@@ -12,6 +13,7 @@ from jax.test_util import check_grads
 
 from jaxfx import _numerics
 from tests.helpers.forms import first
+from tests.helpers.programs import primitives
 
 
 def slopes(function, *arguments):
@@ -121,6 +123,25 @@ def test_working_dtype(given, expected):
             assert _numerics.working_dtype(*given) == expected
             assert _numerics.common_dtype(*given, jnp.float32) == expected
             assert _numerics.common_dtype(given[0]) == given[0]
+
+
+def test_one_program_compiles_once_and_is_written_into_others():
+    traces = []
+
+    @functools.partial(_numerics.one_program, static_argnums=1)
+    def powers(x, exponent):
+        traces.append(exponent)
+        return jnp.sin(x) ** exponent, {"sum": x + exponent}
+
+    for _ in range(2):
+        power, rest = powers(jnp.ones(3), 2)
+    np.testing.assert_allclose(power, np.sin(1) ** 2, rtol=1e-15)
+    np.testing.assert_array_equal(rest["sum"], 3)
+    assert traces == [2]
+    names = set(primitives(jax.make_jaxpr(lambda x: powers(2 * x, 3))(jnp.ones(3)).jaxpr))
+    assert names == {"mul", "sin", "integer_pow", "add"}
+    slope = jax.grad(lambda x: powers(x, 2)[0])(0.5)
+    assert slope == pytest.approx(2 * np.sin(0.5) * np.cos(0.5), rel=1e-14)
 
 
 def test_every_helper_is_tested():

@@ -11,6 +11,7 @@ Here: x right, y down, z forward; pixel centres at +0.5; poses `world_from_camer
 | OpenGL | as Blender | camera from world | 0.5, the first row at the bottom |
 """
 
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx._checks import check, option, parameter
-from jaxfx._numerics import common_dtype, normalize
+from jaxfx._numerics import common_dtype, normalize, one_program
 
 
 # A camera's intrinsics and pose.
@@ -148,6 +149,14 @@ def opengl(view: Any, projection: Any, size: tuple[int, int]) -> CameraFields:
     return intrinsics, _flipped_axes(_inverse_pose(view[:3, :3], view[:3, 3]))
 
 
+@functools.partial(one_program, static_argnums=(1, 2))
+def matrix_of_fov(fov_y: Float[Array, ""], height: int, width: int) -> Float[Array, "3 3"]:
+    """Intrinsics of square pixels with the principal point in the middle of the image."""
+    focal = height / (2 * jnp.tan(fov_y / 2))
+    return matrix(focal, focal, width / 2, height / 2)
+
+
+@one_program
 def matrix(fx: Any, fy: Any, cx: Any, cy: Any) -> Float[Array, "3 3"]:
     """Intrinsics of focal lengths and a principal point, in pixels."""
     numbers = [jnp.asarray(value) for value in (fx, fy, cx, cy)]
@@ -165,6 +174,7 @@ def _positive(name: str, value: Any) -> Float[Array, ""]:
     return number
 
 
+@one_program
 def _inverse_pose(
     rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
 ) -> Float[Array, "4 4"]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
-from jaxfx._numerics import normalize, working_dtype
+from jaxfx._numerics import normalize, one_program, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera._records import Projection, Rays
 from jaxfx.camera.rigid import (
@@ -147,7 +147,10 @@ class OrthographicCamera(eqx.Module):
         >>> print(pixels, depth)
         [6. 3.] 2.0
         """
-        points = read_points(self, "project", points, 3)
+        return self._project(read_points(self, "project", points, 3))
+
+    @one_program
+    def _project(self, points: Float[Array, "... 3"]) -> Projection:
         dtype = points.dtype
         local = to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         pixels = local[..., :2] * self.pixels_per_unit.astype(local.dtype)
@@ -176,7 +179,13 @@ class OrthographicCamera(eqx.Module):
         [0.5 0.  2. ]
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
+        return self._unproject(pixels, depth).astype(dtype)
+
+    @one_program
+    def _unproject(
+        self, pixels: Float[Array, "*shape 2"], depth: Float[Array, "*shape"]
+    ) -> Float[Array, "*shape 3"]:
         plane = pixels - broadcast_like(self.center, pixels)
         plane = plane / self.pixels_per_unit.astype(pixels.dtype)
         local = jnp.concatenate([plane, depth[..., None]], axis=-1)
-        return to_world(self.world_from_camera, local).astype(dtype)
+        return to_world(self.world_from_camera, local)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfx._checks import WholeNumber, check, check_fields, parameter, whole_number
-from jaxfx._numerics import inverse, normalize, working_dtype
+from jaxfx._numerics import inverse, normalize, one_program, working_dtype
 from jaxfx._sampling import pixel_centers
 from jaxfx.camera import _conventions
 from jaxfx.camera._records import Projection, Rays
@@ -121,10 +121,10 @@ class PinholeCamera(eqx.Module):
         fov_y = parameter("from_fov(fov_y)", fov_y)
         check("from_fov(fov_y)", fov_y, lambda v: (v > 0) & (v < jnp.pi), "in (0, pi) radians")
         height, width = _size("from_fov", height, width)
-        focal = height / (2 * jnp.tan(fov_y / 2))
-        intrinsics = _conventions.matrix(focal, focal, width / 2, height / 2)
-        pose = jnp.eye(4, dtype=focal.dtype) if world_from_camera is None else world_from_camera
-        return cls(intrinsics, pose)
+        intrinsics = _conventions.matrix_of_fov(fov_y, height, width)
+        if world_from_camera is None:
+            world_from_camera = np.eye(4, dtype=intrinsics.dtype)
+        return cls(intrinsics, world_from_camera)
 
     @classmethod
     def look_at(
@@ -418,7 +418,10 @@ class PinholeCamera(eqx.Module):
         >>> print(pixels, depth)
         [4. 3.] 2.0
         """
-        points = read_points(self, "project", points, 3)
+        return self._project(read_points(self, "project", points, 3))
+
+    @one_program
+    def _project(self, points: Float[Array, "... 3"]) -> Projection:
         dtype = points.dtype
         local = to_camera(self.world_from_camera, points.astype(working_dtype(dtype)))
         depth = local[..., 2]
@@ -448,8 +451,14 @@ class PinholeCamera(eqx.Module):
         (5, 3)
         """
         pixels, depth, dtype = read_pixels(self, pixels, depth)
+        return self._unproject(pixels, depth).astype(dtype)
+
+    @one_program
+    def _unproject(
+        self, pixels: Float[Array, "*shape 2"], depth: Float[Array, "*shape"]
+    ) -> Float[Array, "*shape 3"]:
         rays = transformed(inverse(self.intrinsics), homogeneous(pixels))
-        return to_world(self.world_from_camera, rays * depth[..., None]).astype(dtype)
+        return to_world(self.world_from_camera, rays * depth[..., None])
 
     def through_lens(self, offset: Any, *, focus_distance: Any) -> "PinholeCamera":
         """The camera at another point of the lens, with the same plane in focus.

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Num
 
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import check, check_fields, check_map, parameter
-from jaxfx._numerics import common_dtype, inverse, normalize, working_dtype
+from jaxfx._numerics import common_dtype, inverse, normalize, one_program, working_dtype
 from jaxfx._sampling import pixel_centers
 
 
@@ -35,6 +35,7 @@ def broadcast_like(
     return jnp.broadcast_to(vector.astype(like.dtype), like.shape)
 
 
+@one_program
 def transformed(
     matrix: Float[Array, "3 3"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
@@ -44,6 +45,7 @@ def transformed(
     return x + y + z
 
 
+@one_program
 def to_world(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
@@ -52,6 +54,7 @@ def to_world(
     return transformed(pose[:3, :3], points) + broadcast_like(pose[:3, 3], points)
 
 
+@one_program
 def to_camera(
     world_from_camera: Float[Array, "4 4"], points: Float[Array, "... 3"]
 ) -> Float[Array, "... 3"]:
@@ -131,6 +134,7 @@ def per_depth(camera: Any, pixels: Float[Array, "... 2"]) -> Float[Array, "... 3
     return broadcast_like(rotation[:, 2], pixels)
 
 
+@one_program
 def homogeneous(pixels: Float[Array, "... 2"]) -> Float[Array, "... 3"]:
     """Homogeneous pixels (x, y, 1)."""
     return jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)

@@ -24,7 +24,7 @@ from jaxfx._checks import (
     number,
     whole_number,
 )
-from jaxfx._numerics import working_dtype
+from jaxfx._numerics import one_program, working_dtype
 from jaxfx.lens import FocusPlanes, Lens, ThinLens
 
 
@@ -118,9 +118,17 @@ def largest_of(function: str, depth: Float[Array, "height width"], lens: Lens) -
     with jax.ensure_compile_time_eval():
         working = depth.astype(working_dtype(depth.dtype))
         circles = compiled(function, lens, working).circle_of_confusion(working)
-        largest = jnp.max(jnp.where((depth > 0) & ~jnp.isnan(circles), circles, 0))
+        largest = _largest(circles, depth)
         # A lens that is no pytree hides what it holds.
         return float(largest) if is_concrete(largest) else None
+
+
+@one_program
+def _largest(
+    circles: Float[Array, "height width"], depth: Float[Array, "height width"]
+) -> Float[Array, ""]:
+    """The largest circle of confusion of a pixel whose depth is known; 0 for none."""
+    return jnp.max(jnp.where((depth > 0) & ~jnp.isnan(circles), circles, 0))
 
 
 class Pixels(NamedTuple):

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxfx._numerics import one_program
 from jaxfx._platform import one_by_one_on_cpu
 
 
@@ -85,6 +86,7 @@ class Principal(NamedTuple):
     is_told: Bool[Array, " unknown"]
 
 
+@one_program
 def principal(columns: Float[Array, "residual unknown"]) -> Principal:
     """The principal combinations of unknowns; `columns` is the Jacobian.
 
@@ -107,11 +109,17 @@ def tiles(shape: tuple[int, ...], side: int = _TILES) -> tuple[Int[Array, " resi
 
     `shape` is height width, and channels, which share their pixel's tile.
     """
+    return _tile_of(shape, side), side * side
+
+
+@functools.partial(one_program, static_argnums=(0, 1))
+def _tile_of(shape, side):
     row, column = (jnp.arange(size) * side // size for size in shape[:2])
     tile = side * row[:, None] + column[None]
-    return jnp.repeat(tile.reshape(-1), math.prod(shape[2:])), side * side
+    return jnp.repeat(tile.reshape(-1), math.prod(shape[2:]))
 
 
+@one_program
 def independent_errors(
     columns: Float[Array, "residual unknown"], residual: Float[Array, "..."]
 ) -> Float[Array, " unknown"]:

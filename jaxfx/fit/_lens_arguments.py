@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxfx._arguments import check_lens
 from jaxfx._checks import check, check_depth, check_image, check_shape, items, option, parameter
+from jaxfx._numerics import one_program
 from jaxfx.dof.iris import Iris
 from jaxfx.dof.sprites import POINT_RADIUS
 from jaxfx.fit._lens_model import DISPARITY, IRIS, LENS, Effect, Images, Values
@@ -85,6 +86,7 @@ def _references(
     return jnp.stack(references)
 
 
+@one_program
 def without_saturated(images: Images) -> Images:
     """The images with weight 0 where a photograph is saturated.
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._numerics import one_program
 from jaxfx.dof.iris import Iris
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
@@ -97,6 +98,7 @@ class Model(eqx.Module):
     max_coc: int | float = eqx.field(static=True)
     peels: bool = eqx.field(static=True, default=False)
 
+    @one_program
     def values(self, unknowns: Values) -> Values:
         """All parameters, in their units, from unknowns, which are 0 at the start.
 

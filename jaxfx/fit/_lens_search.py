@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfx._checks import is_concrete
+from jaxfx._numerics import one_program
 from jaxfx.dof.arguments import largest_coc
 from jaxfx.fit._descent import End
 from jaxfx.fit._in_program import each, stacked
@@ -221,6 +222,7 @@ def _origin(model: Model, ratios: tuple[str, ...]) -> Values:
     return {name: jnp.zeros(shape(name), float) for name in model.names}
 
 
+@one_program
 def _lowest(losses: Float[Array, "..."]) -> Int[Array, " search"]:
     """Flat indices of the `_SEARCHES` lowest local minima of a table, the lowest first.
 

@@ -61,6 +61,7 @@ class Evidence(NamedTuple):
     explained: Float[Array, ""]
 
 
+@eqx.filter_jit
 def evidence(
     model: Model,
     lights: tuple[Light, ...],

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._numerics import one_program
+
 
 # Where Huber's loss turns from squares to sizes, in standard deviations of the noise: for
 # Gaussian noise it then costs 5 % of the precision of least squares. A smaller corner costs
@@ -37,6 +39,7 @@ _Lengths = Float[Array, "2 height width"]
 _Noise = Float[Array, "2"]
 
 
+@one_program
 def huber(residual: Float[Array, "..."], corner: float = CORNER) -> Float[Array, "..."]:
     """Residuals whose squares are twice Huber's loss: beyond the corner they grow by a root.
 
@@ -48,6 +51,7 @@ def huber(residual: Float[Array, "..."], corner: float = CORNER) -> Float[Array,
     return jnp.where(beyond, jnp.sign(residual) * root, residual)
 
 
+@one_program
 def lengths(residual: Float[Array, "height width 3"], weights: _Pixels) -> _Lengths:
     """Lengths over the channels: of each residual, and of the sum over its window.
 
@@ -61,12 +65,14 @@ def lengths(residual: Float[Array, "height width 3"], weights: _Pixels) -> _Leng
     return jnp.sqrt(jnp.sum(jnp.stack([residual, wide]) ** 2, axis=-1))
 
 
+@one_program
 def noise_of(length: _Lengths, weights: _Pixels) -> _Noise:
     """Standard deviations of noise in one channel, from the median length where weights > 0."""
     counted = jnp.where(weights[None] > 0, length, jnp.nan)
     return jnp.nan_to_num(jnp.nanmedian(counted, axis=(1, 2))) / _MEDIAN
 
 
+@one_program
 def biweight(length: _Lengths, noise: _Noise) -> _Pixels:
     """The weight of each pixel, from 1 for no residual to 0 beyond the cut.
 
@@ -75,6 +81,7 @@ def biweight(length: _Lengths, noise: _Noise) -> _Pixels:
     return jnp.prod(jnp.maximum(1 - _relative_squares(length, noise), 0) ** 2, axis=0)
 
 
+@one_program
 def flatness(length: _Lengths, noise: _Noise, weights: _Pixels) -> Float[Array, ""]:
     """The mean slope of a weighted residual in the residual, over the mean weight: at most 1.
 

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfx._loops import scan
+from jaxfx._numerics import one_program
 
 
 # Standard deviation in pixels of the window over which residuals are summed. A smaller one
@@ -194,6 +195,7 @@ def _summed(values: Array, weights: np.ndarray) -> Array:
     return values
 
 
+@one_program
 def best(planes: Planes, candidates: Array) -> Float[Array, "height width"]:
     """The inverse depth of least energy, by a parabola through the best plane's neighbors."""
     energy = planes.energy
@@ -250,6 +252,7 @@ def settled(
     return scan(row, None, jnp.arange(height))[1]
 
 
+@one_program
 def around(mask: Bool[Array, "height width"]) -> Bool[Array, "height width"]:
     """Whether the mask holds anywhere within the reach of `settled`."""
     return _summed(mask.astype(jnp.float32), np.ones(2 * _REACH + 1)) > 0
@@ -261,6 +264,7 @@ def at_index(values: Array, index: Array) -> Array:
     return jnp.take_along_axis(values, index, axis=0)[0]
 
 
+@one_program
 def at_inverse_depth(values: Array, candidates: Array, inverse_depth: Array) -> Array:
     """The values of the planes, interpolated linearly at each pixel's inverse depth."""
     place = (inverse_depth - candidates[0]) / (candidates[1] - candidates[0])

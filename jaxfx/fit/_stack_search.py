@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfx._numerics import one_program
 from jaxfx.dof.layered import layered
 from jaxfx.dof.scatter import scatter
 from jaxfx.fit._lens_model import Effect, missing_blur
@@ -49,6 +50,7 @@ class StackResidual(eqx.Module):
     effect: Effect = eqx.field(static=True)
     max_coc: int | float = eqx.field(static=True)
 
+    @one_program
     def values(self, unknowns: dict[str, Array]) -> tuple[Array, Array]:
         """Image and inverse depth, from unknowns, which are 0 at the start.
 
@@ -63,6 +65,7 @@ class StackResidual(eqx.Module):
         image = self.image + unit * unknowns["change"].astype(unit.dtype)
         return image, jnp.clip(inverse_depth, *self.bounds)
 
+    @one_program
     def drawn(
         self, image: Array, inverse_depth: Array
     ) -> Float[Array, "photograph height width channel"]:
@@ -78,6 +81,7 @@ class StackResidual(eqx.Module):
 
         return jax.lax.map(draw, self.lenses)
 
+    @one_program
     def __call__(self, unknowns: dict[str, Array]) -> Float[Array, " residual"]:
         image, inverse_depth = self.values(unknowns)
         difference = (self.drawn(image, inverse_depth) - self.images) / self.noise

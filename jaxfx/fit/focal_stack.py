@@ -24,7 +24,7 @@ from jaxfx._checks import (
     option,
     whole_number,
 )
-from jaxfx._numerics import working_dtype
+from jaxfx._numerics import one_program, working_dtype
 from jaxfx._progress import Bar
 from jaxfx.fit._descent import End, check_success, descend, verdict
 from jaxfx.fit._lens_model import Effect
@@ -319,6 +319,7 @@ def _largest(strengths: np.ndarray, foci: np.ndarray, low: float, high: float) -
     return float(ends.max())
 
 
+@one_program
 def _errors(planes: Planes, candidates: Array, inverse_depth: Array) -> Array:
     """The standard error of the inverse depth at each pixel; inf where nothing tells it."""
     slope, spread = (
