@@ -1,4 +1,4 @@
-"""Elementwise functions with finite derivatives everywhere, and small dense algebra.
+"""Elementwise functions with finite derivatives everywhere, small dense algebra, `one_program`.
 
 Of arrays alone: nothing here knows the package's types or checks arguments.
 """

@@ -316,11 +316,20 @@ def fill(
                 f"`fill(image)` must have the depth's height and width {values.shape}, "
                 f"got shape {guide.shape}."
             )
+    return Filled(_filled(values, guide, method), is_missing)
+
+
+@functools.partial(one_program, static_argnums=2)
+def _filled(
+    values: Float[Array, "height width"],
+    guide: Float[Array, "height width channel"],
+    method: str,
+) -> Float[Array, "height width"]:
     constant, guide = jax.lax.stop_gradient((values, guide.astype(values.dtype)))
     source = farther_ends(constant)
     if method == "guided":
         source = cheapest_sources(constant, guide, constant.reshape(-1)[source])
-    return Filled(values.reshape(-1)[source], is_missing)
+    return values.reshape(-1)[source]
 
 
 def _numbers(name: str, values: Any) -> tuple[Float[Array, "height width"], bool]:

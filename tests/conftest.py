@@ -100,7 +100,7 @@ def forget_programs():
 
 @pytest.fixture(autouse=True, scope="session")
 def quick_by_default():
-    """Compile with little optimisation, in half to three quarters of the time.
+    """Compile with little optimisation, and trace this platform's programs alone.
 
     `tests/test_transforms.py` compares every function with and without it.
     """
@@ -110,6 +110,6 @@ def quick_by_default():
 
 @pytest.fixture
 def optimised():
-    """Compile with all optimisation, as users do: for costs and for published figures."""
+    """Compile with all optimisation, for all platforms, as users do: for published figures."""
     with compiling.optimised():
         yield

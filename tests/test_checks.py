@@ -49,6 +49,16 @@ def test_arrays_of_other_kinds():
     np.testing.assert_array_equal(traced, [1, 2])
 
 
+def test_a_numpy_array_may_be_written_to_after_it_was_read():
+    for size in (3, 64, 1000, 30_000):  # JAX may share memory that is aligned.
+        for kind in ("float32", "float64", "int32"):
+            given = [np.zeros(size, kind) for _ in range(8)]
+            read = [_checks.as_array("f(x)", each) for each in given]
+            for each in given:
+                each[:] = 1
+            np.testing.assert_array_equal(read, 0)
+
+
 def test_as_numpy_keeps_what_jax_would_cut():
     for value in (np.array([2**40]), np.array([1e300]), np.array([0.5], ">f8")):
         found = _checks.as_numpy("f(x)", value)

@@ -9,7 +9,8 @@ from jax import export
 
 from jaxfx import ThinLens, dof
 from tests.helpers.forms import first
-from tests.helpers.programs import for_accelerators, primitives
+from tests.helpers.programs import primitives
+from tests.helpers.quick import for_accelerators
 from tests.test_transforms import CASES, each
 
 
@@ -24,6 +25,7 @@ def both(call):
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("optimised")
 @each(CASES)
 def test_every_function_and_its_gradient_can_be_lowered_for_accelerators(case):
     call, arguments = case.split()

@@ -5,6 +5,7 @@ import contextlib
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax import export
 
 from jaxfx._platform import (
@@ -15,7 +16,11 @@ from jaxfx._platform import (
     one_by_one,
     one_by_one_on_cpu,
 )
-from tests.helpers.programs import for_accelerators
+from tests.helpers.quick import for_accelerators
+
+
+# Programs for every platform, as users have them.
+pytestmark = pytest.mark.usefixtures("optimised")
 
 
 def _lowered(function, *operands, platform):

@@ -6,7 +6,7 @@ programs.
 
 import pytest
 
-from tests.helpers.programs import for_accelerators
+from tests.helpers.quick import for_accelerators
 
 
 @pytest.fixture(autouse=True, scope="module")

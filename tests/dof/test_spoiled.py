@@ -12,7 +12,8 @@ from jaxfx import ThinLens, dof
 from jaxfx.dof import spoiled as spoiled_module
 from jaxfx.dof.spoiled import spoiled
 from tests.helpers.forms import first
-from tests.helpers.programs import for_accelerators, primitives
+from tests.helpers.programs import primitives
+from tests.helpers.quick import for_accelerators
 
 
 LENS = ThinLens(0.1, 2.5, 200.0)

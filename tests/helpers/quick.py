@@ -1,9 +1,10 @@
-"""Compilation with little optimisation, for tests that measure neither speed nor memory."""
+"""How tests make programs: with little optimisation or all, for a CPU or for accelerators."""
 
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 from jax._src import compiler
@@ -38,26 +39,68 @@ def _use_older_generator() -> None:
     compiler.get_compile_options = options
 
 
-@contextlib.contextmanager
-def _compiled(is_optimised: bool) -> Iterator[None]:
-    """Compile with all optimisation, or with little, in this context.
+class Made(NamedTuple):
+    """How programs are made, in a test."""
 
-    JAX caches compiled programs by function, types and a few settings. Optimisation is not one
-    of them; the precision of matrix products is. It changes no value on a CPU, so it serves to
-    keep the two kinds of programs apart.
-    """
+    is_optimised: bool
+    is_for_accelerators: bool
+
+
+# JAX caches traces and programs by function, types and a few settings. What is asked for here
+# is none of them; the precision of matrix products is. It changes no value on a CPU, so it
+# serves to keep the kinds of programs apart.
+PRECISIONS = {
+    Made(True, False): None,
+    Made(False, False): "highest",
+    Made(True, True): "tensorfloat32",
+    Made(False, True): "float32",
+}
+
+_made = Made(is_optimised=True, is_for_accelerators=False)
+_choose = jax.lax.platform_dependent
+
+
+def _program_of_a_cpu(*operands: Any, **programs: Callable[..., Any]) -> Any:
+    """The program for a CPU alone: not to trace the other one halves the time to trace."""
+    return (programs.get("cpu") or programs["default"])(*operands)
+
+
+def _program_of_an_accelerator(*operands: Any, **programs: Callable[..., Any]) -> Any:
+    return programs["default"](*operands)
+
+
+def _choice() -> Callable[..., Any]:
+    """What stands for `jax.lax.platform_dependent`, which traces the programs of all."""
+    if _made.is_for_accelerators:
+        return _program_of_an_accelerator
+    is_quick_on_cpu = not _made.is_optimised and jax.default_backend() == "cpu"
+    return _program_of_a_cpu if is_quick_on_cpu else _choose
+
+
+@contextlib.contextmanager
+def _making(**changes: bool) -> Iterator[None]:
+    """Make programs another way in this context."""
+    global _made  # noqa: PLW0603
     _use_older_generator()
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", not is_optimised)
+    before, _made = _made, _made._replace(**changes)
+    jax.config.update("jax_disable_most_optimizations", not _made.is_optimised)
     try:
-        with jax.default_matmul_precision(None if is_optimised else "highest"):
+        with (
+            jax.default_matmul_precision(PRECISIONS[_made]),
+            mock.patch.object(jax.lax, "platform_dependent", _choice()),
+        ):
             yield
     finally:
-        jax.config.update("jax_disable_most_optimizations", before)
+        _made = before
+        jax.config.update("jax_disable_most_optimizations", not _made.is_optimised)
 
 
-quickly = functools.partial(_compiled, False)
-optimised = functools.partial(_compiled, True)
+# With little optimisation, and the program for this platform alone.
+quickly = functools.partial(_making, is_optimised=False)
+# As users do, with all optimisation.
+optimised = functools.partial(_making, is_optimised=True)
+# The programs for accelerators, whatever device they then run on.
+for_accelerators = functools.partial(_making, is_for_accelerators=True)
 
 
 def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: float) -> None:
