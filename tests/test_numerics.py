@@ -13,7 +13,6 @@ from jax.test_util import check_grads
 
 from jaxfx import _numerics
 from tests.helpers.forms import first
-from tests.helpers.programs import primitives
 
 
 def slopes(function, *arguments):
@@ -138,8 +137,8 @@ def test_one_program_compiles_once_and_is_written_into_others():
     np.testing.assert_allclose(power, np.sin(1) ** 2, rtol=1e-15)
     np.testing.assert_array_equal(rest["sum"], 3)
     assert traces == [2]
-    names = set(primitives(jax.make_jaxpr(lambda x: powers(2 * x, 3))(jnp.ones(3)).jaxpr))
-    assert names == {"mul", "sin", "integer_pow", "add"}
+    other = jax.jit(lambda x: powers(2 * x, 3)).lower(jnp.ones(3)).as_text()
+    assert "stablehlo.sine" in other and "powers" not in other
     slope = jax.grad(lambda x: powers(x, 2)[0])(0.5)
     assert slope == pytest.approx(2 * np.sin(0.5) * np.cos(0.5), rel=1e-14)
 
