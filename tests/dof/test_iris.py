@@ -149,7 +149,7 @@ def test_an_iris_without_blades_is_the_disc():
     np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
-@first("program", ["shift", "spans"])
+@pytest.mark.parametrize("program", ["shift", "spans"])
 @first("iris", [Iris(6, squeeze=0.9), Iris(5, rotation=0.2, roundness=0.3, squeeze=0.8)])
 def test_scatter_derivatives(iris, program):
     image, depth = random_scene(2)
@@ -248,7 +248,7 @@ def test_energy_of_lights_is_kept(method):
         assert 0 < lit - 25 * float(iris.area()) < 35  # The pixels of the rim count in full.
 
 
-@first("behind", [True, False])
+@pytest.mark.parametrize("behind", [False, True])
 def test_layered_by_an_iris_without_blades_is_the_disc(behind):
     """Two programs: this one paints all slices of a group by the same chords."""
     rng = np.random.default_rng(0)

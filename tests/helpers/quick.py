@@ -39,8 +39,8 @@ def _use_older_generator() -> None:
     compiler.get_compile_options = options
 
 
-class Made(NamedTuple):
-    """How programs are made, in a test."""
+class Kind(NamedTuple):
+    """How a test compiles its programs, and for which devices it traces them."""
 
     is_optimised: bool
     is_for_accelerators: bool
@@ -50,57 +50,62 @@ class Made(NamedTuple):
 # is none of them; the precision of matrix products is. It changes no value on a CPU, so it
 # serves to keep the kinds of programs apart.
 PRECISIONS = {
-    Made(True, False): None,
-    Made(False, False): "highest",
-    Made(True, True): "tensorfloat32",
-    Made(False, True): "float32",
+    Kind(is_optimised=True, is_for_accelerators=False): None,
+    Kind(is_optimised=False, is_for_accelerators=False): "highest",
+    Kind(is_optimised=True, is_for_accelerators=True): "tensorfloat32",
+    Kind(is_optimised=False, is_for_accelerators=True): "float32",
 }
 
-_made = Made(is_optimised=True, is_for_accelerators=False)
-_choose = jax.lax.platform_dependent
+_kind = Kind(is_optimised=True, is_for_accelerators=False)
+_platform_dependent = jax.lax.platform_dependent
 
 
 def _program_of_a_cpu(*operands: Any, **programs: Callable[..., Any]) -> Any:
-    """The program for a CPU alone: not to trace the other one halves the time to trace."""
+    """The program for CPUs. Tracing takes half the time without the one for accelerators."""
     return (programs.get("cpu") or programs["default"])(*operands)
 
 
 def _program_of_an_accelerator(*operands: Any, **programs: Callable[..., Any]) -> Any:
+    """The program for accelerators."""
     return programs["default"](*operands)
 
 
-def _choice() -> Callable[..., Any]:
-    """What stands for `jax.lax.platform_dependent`, which traces the programs of all."""
-    if _made.is_for_accelerators:
+def _replacement() -> Callable[..., Any]:
+    """The function that tests call in place of `jax.lax.platform_dependent`, by `_kind`.
+
+    JAX's own function traces the program of every platform and lowers one of them.
+    """
+    if _kind.is_for_accelerators:
         return _program_of_an_accelerator
-    is_quick_on_cpu = not _made.is_optimised and jax.default_backend() == "cpu"
-    return _program_of_a_cpu if is_quick_on_cpu else _choose
+    if not _kind.is_optimised and jax.default_backend() == "cpu":
+        return _program_of_a_cpu
+    return _platform_dependent
 
 
 @contextlib.contextmanager
-def _making(**changes: bool) -> Iterator[None]:
-    """Make programs another way in this context."""
-    global _made  # noqa: PLW0603
+def _of_kind(**changes: bool) -> Iterator[None]:
+    """Make programs of another kind in this context; fields not given stay as they are."""
+    global _kind  # noqa: PLW0603
     _use_older_generator()
-    before, _made = _made, _made._replace(**changes)
-    jax.config.update("jax_disable_most_optimizations", not _made.is_optimised)
+    before, _kind = _kind, _kind._replace(**changes)
+    jax.config.update("jax_disable_most_optimizations", not _kind.is_optimised)
     try:
         with (
-            jax.default_matmul_precision(PRECISIONS[_made]),
-            mock.patch.object(jax.lax, "platform_dependent", _choice()),
+            jax.default_matmul_precision(PRECISIONS[_kind]),
+            mock.patch.object(jax.lax, "platform_dependent", _replacement()),
         ):
             yield
     finally:
-        _made = before
-        jax.config.update("jax_disable_most_optimizations", not _made.is_optimised)
+        _kind = before
+        jax.config.update("jax_disable_most_optimizations", not _kind.is_optimised)
 
 
 # With little optimisation, and the program for this platform alone.
-quickly = functools.partial(_making, is_optimised=False)
+quickly = functools.partial(_of_kind, is_optimised=False)
 # As users do, with all optimisation.
-optimised = functools.partial(_making, is_optimised=True)
+optimised = functools.partial(_of_kind, is_optimised=True)
 # The programs for accelerators, whatever device they then run on.
-for_accelerators = functools.partial(_making, is_for_accelerators=True)
+for_accelerators = functools.partial(_of_kind, is_for_accelerators=True)
 
 
 def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: float) -> None:
