@@ -10,7 +10,7 @@ from jax import export
 from jaxfx import ThinLens, dof
 from tests.helpers.forms import first
 from tests.helpers.programs import primitives
-from tests.helpers.quick import for_accelerators
+from tests.helpers.quick import for_accelerators, optimised
 from tests.test_transforms import CASES, each
 
 
@@ -70,13 +70,15 @@ def case_of(transform):
     ("name", "transform"),
     [*((("scatter", transform)) for transform in TRANSFORMS), ("depth_sorted", "gradient")],
 )
-def test_accelerators_compute_what_cpus_do(name, transform):
+def test_every_kind_of_program_computes_the_same(name, transform):
+    """A CPU's alone, those for accelerators, and the choice of a platform that users have."""
     call, data = TRANSFORMS[transform](METHODS[name]), case_of(transform)
     expected = jax.jit(call)(*data)
-    with for_accelerators():
-        found = jax.jit(call)(*data)
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+    for kind in (for_accelerators, optimised):
+        with kind():
+            found = jax.jit(call)(*data)
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
 
 
 @first("transform", TRANSFORMS, 2)
