@@ -14,7 +14,7 @@ counts least: it shows what a thin surface there does not hide.
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ WINDOW = 1.5
 # and aliasing, which neighbors share, would make standard errors too small.
 _BLOCK = 5
 # Noise that is always allowed for, as a ratio to the images' root mean square.
-_LEAST_NOISE = 1e-3
+LEAST_NOISE = 1e-3
 # Circle of confusion in pixels from which on an image counts less under a plane: where it is in
 # focus beyond the plane, and where before it. With a smaller first one the surfaces behind lose
 # what is beside a near one, with a larger one thin near surfaces are missed.
@@ -72,6 +72,72 @@ class Planes(NamedTuple):
     image: Float[Array, "plane height width channel"]
 
 
+class _Stack:
+    """The spectra of a stack, and what is left of it under a candidate plane.
+
+    `strengths` are the diameters of circles of confusion per unit of inverse depth, in pixels,
+    `foci` the inverse depths in focus; `pad` is how many pixels the images are mirrored beyond
+    their border.
+    """
+
+    def __init__(self, images: Array, strengths: Array, foci: Array, pad: int) -> None:
+        self.strengths, self.foci, self.pad = strengths, foci, pad
+        self.size, self.dtype = images.shape[1:3], images.dtype
+        mirrored = jnp.pad(images, ((0, 0), (pad, pad), (pad, pad), (0, 0)), mode="symmetric")
+        self.padded = rows, columns = mirrored.shape[1:3]
+        self.spectra = jnp.fft.rfft2(mirrored, axes=(1, 2))
+        frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None])
+        self.frequency = jnp.asarray(frequency, self.dtype)
+
+    def image_of(self, spectrum: Array) -> Array:
+        """The pixels of a spectrum, without what is beyond the border."""
+        whole = jnp.fft.irfft2(spectrum, s=self.padded, axes=(-3, -2))
+        (height, width), pad = self.size, self.pad
+        return whole[..., pad : pad + height, pad : pad + width, :].astype(self.dtype)
+
+    def seen(self, inverse_depth: Array, weighed_at: Array) -> tuple[Array, Array]:
+        """The root of each image's weight, and the transform of its disc times that root.
+
+        The weights are those of a plane at `weighed_at`.
+        """
+        defocus = self.strengths * (self.foci - weighed_at)
+        reach = jnp.where(defocus < 0, _BEYOND, _BEFORE).astype(self.dtype)
+        weights = 1 / (1 + (defocus / reach) ** 2)
+        roots = jnp.sqrt(weights / jnp.max(weights))[:, None, None]
+        circles = jnp.abs(self.strengths * (self.foci - inverse_depth))
+        return roots, roots * jax.vmap(lambda c: disc(c * self.frequency))(circles)
+
+    def fitted(self, inverse_depth: Array, weighed_at: Array) -> tuple[Array, Array, Array]:
+        """The residuals under a plane, those with high frequencies raised, and its image."""
+        roots, blurs = (x[..., None] for x in self.seen(inverse_depth, weighed_at))
+        quotients = blurs / (jnp.sum(blurs * blurs, axis=0) + _NOISE)[None]
+        # The mean square frequency of an image is 1 / 6: white noise keeps its power.
+        rise = (math.sqrt(6) * self.frequency)[..., None]
+        roots, blurs, quotients, rise = (
+            x.astype(self.spectra.dtype) for x in (roots, blurs, quotients, rise)
+        )
+        sharp = jnp.sum(quotients * roots * self.spectra, axis=0)
+        left = roots * self.spectra - blurs * sharp[None]
+        return self.image_of(left), self.image_of(rise[None] * left), self.image_of(sharp)
+
+    def projector(self, inverse_depth: Array, weighed_at: Array) -> Array:
+        """The matrix, at each frequency, from images to residuals under one plane."""
+        roots, blurs = self.seen(inverse_depth, weighed_at)
+        power = jnp.sum(blurs * blurs, axis=0) + _NOISE
+        one = jnp.eye(len(self.foci), dtype=self.dtype)[..., None, None]
+        return roots[:, None] * one - blurs[:, None] * (roots * blurs)[None] / power[None, None]
+
+    def energy(self, plain: Array, risen: Array, projector: Array) -> Array:
+        """The energy of a plane, see `Planes`, from the sums in the window of its residuals."""
+        # What unrelated images would leave: in the plain sum and in that of high frequencies.
+        unrelated = jnp.sum(projector * projector, axis=(0, 1))
+        # Their power; times the square of the rise it is even.
+        frequency = self.frequency
+        pink = jnp.where(frequency > 0, 1 / jnp.where(frequency > 0, frequency, 1) ** 2, 0)
+        share = jnp.mean(unrelated) * jnp.sum(pink * unrelated) / jnp.sum(pink)
+        return jnp.sqrt(plain) * jnp.sqrt(risen) / jnp.sqrt(share)
+
+
 @functools.partial(jax.jit, static_argnames=("pad",))
 def compared(
     images: Float[Array, "photograph height width channel"],
@@ -80,72 +146,60 @@ def compared(
     candidates: Float[Array, " plane"],
     pad: int,
 ) -> Planes:
-    """The planes at inverse depths `candidates`, for lenses in focus at inverse depths `foci`.
-
-    `strengths` are the diameters of circles of confusion per unit of inverse depth, in pixels;
-    `pad` is how many pixels the images are mirrored beyond their border.
-    """
-    _, height, width, _ = images.shape
-    dtype = images.dtype
-    mirrored = jnp.pad(images, ((0, 0), (pad, pad), (pad, pad), (0, 0)), mode="symmetric")
-    rows, columns = mirrored.shape[1:3]
-    spectra = jnp.fft.rfft2(mirrored, axes=(1, 2))
-    frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None])
-    frequency = jnp.asarray(frequency, dtype)
-    # The mean square frequency of an image is 1 / 6: white noise keeps its power.
-    rise = (math.sqrt(6) * frequency)[..., None].astype(spectra.dtype)
-    # The power of unrelated images; times the square of `rise` it is even.
-    pink = jnp.where(frequency > 0, 1 / jnp.where(frequency > 0, frequency, 1) ** 2, 0)
-
-    def image_of(spectrum: Array) -> Array:
-        size, axes = (rows, columns), (-3, -2)
-        whole = jnp.fft.irfft2(spectrum, s=size, axes=axes)
-        return whole[..., pad : pad + height, pad : pad + width, :].astype(dtype)
-
-    def seen(inverse_depth: Array) -> tuple[Array, Array]:
-        """The root of each image's weight, and the transform of its disc times that root."""
-        defocus = strengths * (foci - inverse_depth)
-        reach = jnp.where(defocus < 0, _BEYOND, _BEFORE).astype(dtype)
-        weights = 1 / (1 + jax.lax.stop_gradient(defocus / reach) ** 2)
-        roots = jnp.sqrt(weights / jnp.max(weights))[:, None, None]
-        return roots, roots * jax.vmap(lambda c: disc(c * frequency))(jnp.abs(defocus))
-
-    def fitted(inverse_depth: Array) -> tuple[Array, Array, Array]:
-        roots, blurs = (x[..., None] for x in seen(inverse_depth))
-        quotients = blurs / (jnp.sum(blurs * blurs, axis=0) + _NOISE)[None]
-        roots, blurs, quotients = (x.astype(spectra.dtype) for x in (roots, blurs, quotients))
-        sharp = jnp.sum(quotients * roots * spectra, axis=0)
-        left = roots * spectra - blurs * sharp[None]
-        return image_of(left), image_of(rise[None] * left), image_of(sharp)
-
-    def projector(inverse_depth: Array) -> Array:
-        """The matrix, at each frequency, from images to residuals under one plane."""
-        roots, blurs = seen(inverse_depth)
-        power = jnp.sum(blurs * blurs, axis=0) + _NOISE
-        one = jnp.eye(len(foci), dtype=dtype)[..., None, None]
-        return roots[:, None] * one - blurs[:, None] * (roots * blurs)[None] / power[None, None]
-
-    floor = _LEAST_NOISE**2 * jnp.mean(images * images)
+    """The planes at inverse depths `candidates`; for the other arguments see `_Stack`."""
+    stack = _Stack(images, strengths, foci, pad)
+    floor = LEAST_NOISE**2 * jnp.mean(images * images)
 
     def plane(carry: None, inverse_depth: Array) -> tuple[None, Planes]:
-        one = jnp.ones_like(inverse_depth)
-        (residual, fine, sharp), (slope, *_) = jax.jvp(fitted, (inverse_depth,), (one,))
+        along = (inverse_depth,), (jnp.ones_like(inverse_depth),)
+        fitted = lambda at: stack.fitted(at, inverse_depth)
+        (residual, fine, sharp), (slope, *_) = jax.jvp(fitted, *along)
         over = (0, 3)
         # Noise alone has slopes too: as much, for the residuals that it leaves, as white noise.
-        left, turned = jax.jvp(projector, (inverse_depth,), (one,))
+        left, turned = jax.jvp(lambda at: stack.projector(at, inverse_depth), *along)
         white = jnp.sum(turned * turned) / jnp.sum(left * left)
-        # What unrelated images would leave: in the plain sum and in that of high frequencies.
-        unrelated = jnp.sum(left * left, axis=(0, 1))
-        share = jnp.mean(unrelated) * jnp.sum(pink * unrelated) / jnp.sum(pink)
         plain, risen = (windowed(jnp.sum(x * x, axis=over)) for x in (residual, fine))
         steepness = jnp.sum(slope * slope, axis=over)
         score = _boxed(jnp.sum(residual * slope, axis=over)) / _BLOCK
         spread = windowed(score * score + floor * steepness)
         told = jnp.maximum(windowed(steepness) - white * plain, 0)
-        energy = jnp.sqrt(plain) * jnp.sqrt(risen) / jnp.sqrt(share)
-        return carry, Planes(energy, told, spread, sharp)
+        return carry, Planes(stack.energy(plain, risen, left), told, spread, sharp)
 
     return scan(plane, None, candidates)[1]
+
+
+def least_energy(
+    images: Float[Array, "photograph height width channel"],
+    strengths: Float[Array, " photograph"],
+    foci: Float[Array, " photograph"],
+    candidates: Float[Array, " plane"],
+    pad: int,
+) -> Float[Array, "height width"]:
+    """Each pixel's energy under the best plane, by a parabola as in `best`.
+
+    No plane is kept, for a derivative neither: that of `strengths` and `foci` recomputes them.
+    """
+    stack = _Stack(images, strengths, foci, pad)
+
+    @jax.checkpoint
+    def energy(at: Array) -> Array:
+        residual, fine, _ = stack.fitted(at, at)
+        plain, risen = (windowed(jnp.sum(x * x, axis=(0, 3))) for x in (residual, fine))
+        return stack.energy(plain, risen, stack.projector(at, at))
+
+    def plane(carry: tuple[Array, Array, Array], at: Array) -> tuple[Any, None]:
+        least, before, middle = carry
+        after = energy(at)
+        bend = before - 2 * middle + after
+        is_vertex = (middle <= before) & (middle <= after) & (bend > 0)
+        # Ones in place of what is not taken keep its derivative finite.
+        fall = jnp.where(is_vertex, before - after, 1) ** 2
+        vertex = middle - fall / (8 * jnp.where(is_vertex, bend, 1))
+        return (jnp.where(is_vertex, jnp.minimum(least, vertex), least), middle, after), None
+
+    first, second = energy(candidates[0]), energy(candidates[1])
+    (least, _, last), _ = scan(plane, (first, first, second), candidates[2:])
+    return jnp.minimum(least, last)
 
 
 def disc(cycles: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -250,6 +304,32 @@ def settled(
         return carry, jnp.where(sums[-1] > 0, median, inverse_depth[at])
 
     return scan(row, None, jnp.arange(height))[1]
+
+
+@one_program
+def explained(
+    images: Float[Array, "photograph height width channel"],
+    drawn: Float[Array, "photograph height width channel"],
+) -> Float[Array, ""]:
+    """The median share of what varies between images that those that are drawn explain.
+
+    Over windows that vary twice as much as noise would, and without the noise. It is that of
+    the image that has least, from its mixed second differences (Immerkaer 1996); the median of
+    their sizes is that of noise, with few edges. -inf where nothing varies.
+    """
+    mixed = jnp.diff(jnp.diff(images, n=2, axis=1), n=2, axis=2) / 6
+    deviation = jnp.median(jnp.abs(mixed), axis=(1, 2, 3)) / 0.6745
+    noise = jnp.min(deviation**2)
+    noise = jnp.where(jnp.isfinite(noise), noise, 0)
+    window = 2 * math.pi * WINDOW**2
+    mean = jnp.mean(images, axis=0, keepdims=True)
+    left, varies = (
+        windowed(jnp.mean(x * x, axis=(0, 3))) / window for x in (drawn - images, images - mean)
+    )
+    is_seen = varies > 2 * noise + LEAST_NOISE**2 * jnp.mean(images * images)
+    share = jnp.maximum(left - noise, 0) / jnp.where(is_seen, varies - noise, 1)
+    ratio = jnp.nanmedian(jnp.where(is_seen, share, jnp.nan))
+    return jnp.where(jnp.any(is_seen), 1 - ratio, -jnp.inf)
 
 
 @one_program
