@@ -175,11 +175,14 @@ def least_energy(
     candidates: Float[Array, " plane"],
     pad: int,
 ) -> Float[Array, "height width"]:
-    """Each pixel's energy under the best plane, by a parabola as in `best`.
+    """The logarithm of each pixel's energy under the best plane over noise, from 0.
 
-    No plane is kept, for a derivative neither: that of `strengths` and `foci` recomputes them.
+    Between planes the energy is a parabola, as in `best`. No plane is kept, for a derivative
+    neither: that of `strengths` and `foci` computes them again.
     """
     stack = _Stack(images, strengths, foci, pad)
+    area = 2 * math.pi * WINDOW**2 * images.shape[-1]
+    noise = LEAST_NOISE**2 * area * jnp.mean(images * images)
 
     @jax.checkpoint
     def energy(at: Array) -> Array:
@@ -194,12 +197,13 @@ def least_energy(
         is_vertex = (middle <= before) & (middle <= after) & (bend > 0)
         # Ones in place of what is not taken keep its derivative finite.
         fall = jnp.where(is_vertex, before - after, 1) ** 2
-        vertex = middle - fall / (8 * jnp.where(is_vertex, bend, 1))
+        # A parabola through energies near 0 may pass below it.
+        vertex = jnp.maximum(middle - fall / (8 * jnp.where(is_vertex, bend, 1)), 0)
         return (jnp.where(is_vertex, jnp.minimum(least, vertex), least), middle, after), None
 
     first, second = energy(candidates[0]), energy(candidates[1])
     (least, _, last), _ = scan(plane, (first, first, second), candidates[2:])
-    return jnp.minimum(least, last)
+    return jnp.log1p(jnp.minimum(least, last) / jnp.maximum(noise, jnp.finfo(noise.dtype).tiny))
 
 
 def disc(cycles: Float[Array, "..."]) -> Float[Array, "..."]:

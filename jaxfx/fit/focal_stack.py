@@ -29,7 +29,7 @@ from jaxfx._numerics import one_program, working_dtype
 from jaxfx._progress import Bar
 from jaxfx.fit._descent import End, check_success, descend, verdict
 from jaxfx.fit._lens_model import Effect
-from jaxfx.fit._stack_lenses import Lines, Unknown, searched
+from jaxfx.fit._stack_lenses import Found, Lines, Unknown, searched
 from jaxfx.fit._stack_planes import (
     WINDOW,
     Planes,
@@ -234,7 +234,7 @@ def focal_stack(
     with Bar(progress, "fit") as bar:
         if unknown is not None:
             found = searched(stack, lines, bounds, unknown, bar)
-            lenses, errors = _with_lines(lenses, found.lines, found.covariance, unknown)
+            lenses, errors = _with_lines(lenses, found, unknown)
             lines = _lines(lenses)
             bounds = _range(lines.foci, min_depth, max_depth)
             largest = _largest(lines, bounds)
@@ -322,26 +322,21 @@ def _lines(lenses: tuple[ThinLens, ...]) -> Lines:
 
 
 def _with_lines(
-    lenses: tuple[ThinLens, ...], lines: Lines, covariance: np.ndarray, unknown: Unknown
+    lenses: tuple[ThinLens, ...], found: Found, unknown: Unknown
 ) -> tuple[tuple[ThinLens, ...], dict[str, Array]]:
-    """The lenses with the numbers that were found, and their standard errors."""
+    """The lenses with the numbers that were found, and these numbers' standard errors."""
     if unknown == "aperture":
-        values = lines.strengths / np.array([float(lens.focal_pixels) for lens in lenses])
-        scales = values
+        values = found.lines.strengths / np.array([float(x.focal_pixels) for x in lenses])
+        errors = found.errors * values
     else:
         # Nothing is in focus beyond infinity.
-        values = 1 / np.maximum(lines.foci, 1e-3 * lines.foci.max())
-        scales = values**2
+        values = 1 / np.maximum(found.lines.foci, 1e-3 * found.lines.foci.max())
+        errors = found.errors * values**2
     moved = tuple(
-        replace(
-            lens, **{unknown: jnp.asarray(value, jnp.asarray(getattr(lens, unknown)).dtype)}
-        )
+        replace(lens, **{unknown: jnp.asarray(value, jnp.asarray(lens.aperture).dtype)})
         for lens, value in zip(lenses, values, strict=True)
     )
-    with np.errstate(invalid="ignore"):
-        errors = scales * np.sqrt(np.diag(covariance))
-    errors = jnp.asarray(np.where(np.isfinite(errors), errors, np.inf))
-    return moved, {cast(str, unknown): errors}
+    return moved, {cast(str, unknown): jnp.asarray(errors)}
 
 
 def _range(foci: np.ndarray, min_depth: Any, max_depth: Any) -> tuple[float, float]:
