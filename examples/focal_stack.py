@@ -15,6 +15,7 @@ import argparse
 import json
 import math
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -29,7 +30,8 @@ from jaxfx import ThinLens, dof, exr, fit, io, metrics, relight, scene
 from jaxfx._files import write_whole
 
 
-# The lens of the renderings: scene units, and foci evenly spaced in inverse depth.
+# The lens of the renderings: scene units, and foci evenly spaced in inverse depth. The largest
+# circle of confusion is a tenth of the images' width.
 APERTURE, NEAREST, FARTHEST, COUNT = 0.1, 1.0, 8.0, 5
 # Depths between which the still life lies.
 RANGE = {"min_depth": 0.75, "max_depth": 9.0}
@@ -45,17 +47,25 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("folder", type=Path, nargs="?", help="images and lenses.json")
     parser.add_argument("--size", type=int, default=160, help="width of renderings, pixels")
+    parser.add_argument("--aperture", type=float, default=APERTURE, help="of renderings")
     parser.add_argument("--samples", type=int, default=SAMPLES, help="passes of each rendering")
     parser.add_argument("--steps", type=int, default=8, help="of the search")
+    parser.add_argument(
+        "--unknown",
+        choices=("aperture", "focus_distance"),
+        help="of the lenses, searched for too, from those given; renderings' are a fifth off",
+    )
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder to write to")
     arguments = parser.parse_args()
     for name, least in (("size", 16), ("samples", 1), ("steps", 0)):
         if getattr(arguments, name) < least:
             parser.error(f"--{name} must be at least {least}, got {getattr(arguments, name)}")
+    if not 0 < arguments.aperture < math.inf:
+        parser.error(f"--aperture must be positive, got {arguments.aperture}")
     return arguments
 
 
-def rendered(width: int, samples: int):
+def rendered(width: int, samples: int, aperture: float = APERTURE):
     """Images of the still life, their lenses, and the true image and depth."""
     height = 3 * width // 4
     mesh = scene.still_life()
@@ -69,10 +79,10 @@ def rendered(width: int, samples: int):
     render = lambda eye: shade(seen(eye), eye, lights)
     foci = 1 / np.linspace(1 / NEAREST, 1 / FARTHEST, COUNT)
     # The same blur as a ratio to the width, whatever the size.
-    lens = lambda aperture, focus: ThinLens.from_camera(
-        camera, aperture=aperture, focus_distance=float(focus)
+    lens = lambda size, focus: ThinLens.from_camera(
+        camera, aperture=size, focus_distance=float(focus)
     )
-    lenses = [lens(APERTURE, focus) for focus in foci]
+    lenses = [lens(aperture, focus) for focus in foci]
     images = [
         np.asarray(dof.accumulate(render, camera, each, samples=samples, seed=SEED).image)
         for each in tqdm(lenses, desc="render", leave=False)
@@ -96,6 +106,19 @@ def read(folder: Path):
     except (OSError, ValueError, KeyError, TypeError) as error:
         fail(f"{folder}: {type(error).__name__}: {error}")
     return images, lenses
+
+
+def wrong(lenses, unknown):
+    """Lenses whose apertures are a fifth too large, or foci a fifth of their steps off."""
+    if unknown == "aperture":
+        return [replace(lens, aperture=1.2 * lens.aperture) for lens in lenses]
+    inverse = np.array([1 / float(lens.focus_distance) for lens in lenses])
+    signs = np.where(np.arange(len(lenses)) % 2 == 0, 1, -1)
+    inverse = inverse + 0.2 * np.ptp(inverse) / (len(lenses) - 1) * (signs - signs.mean())
+    return [
+        replace(lens, focus_distance=1 / at)
+        for lens, at in zip(lenses, inverse.astype(np.float32), strict=True)
+    ]
 
 
 def depth_from_focus(images, lenses):
@@ -181,15 +204,20 @@ def main() -> None:
     arguments = parse()
     out = make_folder(arguments.out)
     sharp = depth = None
+    unknown = arguments.unknown
     if arguments.folder is None:
-        images, lenses, sharp, depth = rendered(arguments.size, arguments.samples)
+        images, lenses, sharp, depth = rendered(
+            arguments.size, arguments.samples, arguments.aperture
+        )
+        start = lenses if unknown is None else wrong(lenses, unknown)
     else:
-        images, lenses = read(arguments.folder)
+        images, start = read(arguments.folder)
+        lenses = None
     started = time.perf_counter()
     options = {"max_steps": arguments.steps, "throw": False, "progress": True}
     options |= RANGE if arguments.folder is None else {}
     try:
-        found = fit.focal_stack(images, lenses, **options)
+        found = fit.focal_stack(images, start, unknown=unknown, **options)
     except ValueError as error:
         fail(error)
     report = {
@@ -199,6 +227,15 @@ def main() -> None:
         "explained": float(found.explained),
         "doubt": found.doubt,
     }
+    if unknown is not None:
+        numbers = lambda some: [float(getattr(lens, unknown)) for lens in some]
+        report[unknown] = {
+            "start": numbers(start),
+            "found": numbers(found.lenses),
+            "standard error": np.asarray(found.standard_errors[unknown]).tolist(),
+        }
+        if lenses is not None:
+            report[unknown]["true"] = numbers(lenses)
     error = np.asarray(found.standard_errors["depth"])
     io.write_png(out / "image.png", np.clip(found.image, 0, 1))
     exr.write(
