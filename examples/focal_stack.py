@@ -51,7 +51,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--samples", type=int, default=SAMPLES, help="passes of each rendering")
     parser.add_argument("--steps", type=int, default=8, help="of the search")
     parser.add_argument(
-        "--unknown",
+        "--find",
         choices=("aperture", "focus_distance"),
         help="of the lenses, searched for too, from those given; renderings' are a fifth off",
     )
@@ -204,7 +204,8 @@ def main() -> None:
     arguments = parse()
     out = make_folder(arguments.out)
     sharp = depth = None
-    unknown = arguments.unknown
+    unknown = arguments.find
+    parameters = set() if unknown is None else {unknown}
     if arguments.folder is None:
         images, lenses, sharp, depth = rendered(
             arguments.size, arguments.samples, arguments.aperture
@@ -217,7 +218,7 @@ def main() -> None:
     options = {"max_steps": arguments.steps, "throw": False, "progress": True}
     options |= RANGE if arguments.folder is None else {}
     try:
-        found = fit.focal_stack(images, start, unknown=unknown, **options)
+        found = fit.focal_stack(images, start, parameters=parameters, **options)
     except ValueError as error:
         fail(error)
     report = {

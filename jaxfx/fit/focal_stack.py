@@ -1,7 +1,7 @@
 """The all-in-focus image and the depth of a scene, from images at several focus distances."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any, cast, final, get_args
 
@@ -48,9 +48,9 @@ from jaxfx.lens import ThinLens
 # depth that is determined, and of a number of a lens, over its value; the least share of pixels
 # that are determined; the least variation from image to image that is explained; the largest
 # difference in exposure. Looser bounds trust stacks that show nothing, tighter ones doubt those
-# of which half is even. Scenes of 160 and more pixels' width explain 0.93 to 1, noise or not,
-# a fence of bars two pixels wide, which is wrong by a quarter, 0.6 to 0.7.
-_MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.85, 0.05
+# of which half is even. Scenes 128 and more pixels wide explain 0.93 to 1, noise or not, 0.9
+# with apertures 2 % off; a fence of bars two pixels wide, wrong by a quarter, 0.6 to 0.7.
+_MOST_ERROR, _LEAST_SHARE, _LEAST_EXPLAINED, _MOST_EXPOSURE = 0.1, 0.05, 0.8, 0.05
 # Ratio of energies: up to this one the images agree with what is filled as with what was found.
 # A smaller one leaves noise where nothing is told, a larger one fills thin surfaces up.
 _MOST_ENERGY_RATIO = 1.25
@@ -74,8 +74,8 @@ class FocalStackFit(eqx.Module):
     - `standard_errors`: `"depth"`, height width, in scene units, from the images alone, without
       the prior: inf where they tell nothing. From the residuals in a window of some 14 pixels;
       errors of pixels more than 5 apart are taken for independent. That a window shows two
-      surfaces is not in it, nor are errors of the lenses. With `unknown`, under its name, those
-      of each lens, in scene units.
+      surfaces is not in it, nor are errors of the lenses. Of a lens' number that was searched
+      for, under its name, those of each lens, in scene units.
     - `determined`: height width, where the standard error is below a tenth of the depth.
     - `share`: the share of pixels, a ratio, that are determined.
     - `explained`: how much of what varies from image to image is explained, without noise: the
@@ -132,7 +132,7 @@ def focal_stack(
     *,
     min_depth: Number | None = None,
     max_depth: Number | None = None,
-    unknown: Unknown | None = None,
+    parameters: Collection[str] = (),
     effect: Effect = "scatter",
     smoothness: Number = 1.0,
     max_steps: WholeNumber = 8,
@@ -148,15 +148,14 @@ def focal_stack(
 
     - `images`: height width channel each, linear radiance, two or more of one exposure.
     - `lenses`: one for each image, lengths in scene units; at least two focus distances. Known,
-      but for what is `unknown`, of which they are the start.
+      but for `parameters`, of which they are the start.
     - `min_depth`, `max_depth`: static; scene units, the depths between which it is sought. By
       default half a step of inverse focus distance beyond the least and the largest.
-    - `unknown`: static; what is searched for too. `"aperture"`: one factor of all apertures; it
-      takes focus distances that are known. `"focus_distance"`: each one's, from steps up to
-      half as large or as small again as the true ones; the mean of the inverse focus distances
-      stays that of the start, for images tell a shift of the lenses from one of the scene by
-      nothing. Aperture and focus distances together have a common scale that nothing tells:
-      take any aperture then, and depths are in its scale.
+    - `parameters`: what of the lenses is searched for too, one at most. `{"aperture"}`: a
+      factor of all apertures; focus distances must be known. `{"focus_distance"}`: each one's,
+      from up to half a step between them off; their mean inverse stays that of the start, for
+      a shift of all is a shift of the scene. The two together have a scale that images do not
+      tell: take any aperture then, and depths are in its scale.
     - `effect`: the function of `jaxfx.dof` through which the search goes, `"scatter"` or
       `"layered"`, which takes longer.
     - `smoothness`: weight of the prior, a ratio: each bend of the inverse depth counts like a
@@ -168,9 +167,9 @@ def focal_stack(
     **Returns:** a `FocalStackFit`.
 
     **Raises:** `ValueError` for a single image, shapes or numbers that differ, an image that is
-    not finite, a lens that is none, lenses whose circles of confusion are alike, an option that
-    is none, or a range without depths. `RuntimeError` where the fit is no success and `throw`
-    is true.
+    not finite, a lens that is none, lenses whose circles of confusion are alike, parameters
+    that are none or several, or a range without depths. `RuntimeError` where the fit is no
+    success and `throw` is true.
 
     **Gradient:** none through the search: it stops at every step to report.
 
@@ -224,8 +223,7 @@ def focal_stack(
     max_steps = whole_number(
         "focal_stack(max_steps=...)", max_steps, lambda n: n >= 0, "an integer from 0"
     )
-    if unknown is not None:
-        option("focal_stack(unknown=...)", unknown, get_args(Unknown))
+    unknown = _unknown(parameters)
     dtype = stack.dtype
     lines = _lines(lenses)
     bounds = _range(lines.foci, min_depth, max_depth)
@@ -314,6 +312,18 @@ def _checked(images: Any, lenses: Any) -> tuple[Array, tuple[ThinLens, ...]]:
             raise ValueError(f"`{name}` must be a ThinLens, got {type(lens).__name__}.")
         check_lens(name, lens)
     return jnp.stack([image.astype(checked[0].dtype) for image in checked]), lenses
+
+
+def _unknown(parameters: Any) -> Unknown | None:
+    """The one that is searched for, if any; `ValueError` for others or several."""
+    choices = get_args(Unknown)
+    is_collection = isinstance(parameters, Collection) and not isinstance(parameters, str)
+    if not is_collection or len(parameters) > 1 or not set(parameters) <= set(choices):
+        raise ValueError(
+            "`focal_stack(parameters=...)` must hold one of the names "
+            f"{choices} or none, got {parameters!r:.60}."
+        )
+    return next(iter(parameters), None)
 
 
 def _lines(lenses: tuple[ThinLens, ...]) -> Lines:
