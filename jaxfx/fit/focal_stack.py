@@ -323,7 +323,7 @@ def _unknown(parameters: Any) -> Unknown | None:
             "`focal_stack(parameters=...)` must hold one of the names "
             f"{choices} or none, got {parameters!r:.60}."
         )
-    return next(iter(parameters), None)
+    return cast(Any, next(iter(parameters), None))
 
 
 def _lines(lenses: tuple[ThinLens, ...]) -> Lines:

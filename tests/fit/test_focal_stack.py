@@ -181,10 +181,7 @@ WRONG = {
     "range": ({"min_depth": 3.0, "max_depth": 2.0}, "less than `max_depth`, got 3 and 2"),
     "depth": ({"min_depth": -1.0}, "positive and finite"),
     "effect": ({"effect": "gather"}, "one of"),
-    "parameter": (
-        {"parameters": ["focal_pixels"]},
-        r"one of .* or none, got \('focal_pixels',\)",
-    ),
+    "parameter": ({"parameters": ["focal_pixels"]}, "or none, got .'focal_pixels'"),
     "parameters": ({"parameters": ["aperture", "focus_distance"]}, "one of"),
     "smoothness": ({"smoothness": -1.0}, "0 or positive"),
     "steps": ({"max_steps": -1}, "integer from 0"),
