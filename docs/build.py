@@ -89,7 +89,10 @@ def anchors() -> dict[str, str]:
 
 
 def linked(text: str, up: str, places: dict[str, str], page: str = "") -> str:
-    """Markdown whose public names in backticks lead to the reference; code stays as it is."""
+    """Markdown whose public names in backticks lead to the reference, as notebooks to guides.
+
+    Code stays as it is.
+    """
 
     def link(match):
         place = places.get(match[1].split("(")[0])
@@ -99,7 +102,7 @@ def linked(text: str, up: str, places: dict[str, str], page: str = "") -> str:
     parts[::2] = [
         re.sub(r"(?<![`\[])`([\w.]+(?:\([^`]*\))?)`(?!`)", link, s) for s in parts[::2]
     ]
-    return "".join(parts)
+    return re.sub(r"\]\(\.\./notebooks/(\w+)\.ipynb\)", rf"]({up}guides/\1.md)", "".join(parts))
 
 
 def fenced(doc: str) -> str:
