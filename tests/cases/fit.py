@@ -4,13 +4,14 @@ import functools as ft
 
 import numpy as np
 
-from jaxfx import DirectionalLight, ThinLens, depth as depths, dof, fit, relight
+from jaxfx import DirectionalLight, ThinLens, blur, depth as depths, dof, fit, relight
 from tests.cases import lit
 from tests.cases.registry import Found, case
 
 
 LOSSES = ("robust", "squares")
 COUNT = 8
+STACK_FOCI = (1.5, 1.9, 2.5, 3.6)
 
 
 def _lit(change, loss, **options):
@@ -237,7 +238,7 @@ def a_focal_stack_of_half_an_even_wall(_):
     rng, size = np.random.default_rng(4), (40, 64)
     texture = np.kron(rng.random((20, 32, 3)), np.ones((2, 2, 1)))
     image = np.where(np.arange(64)[:, None] < 32, texture, 0.5)
-    depth, lenses = np.full(size, 2.0), [ThinLens(0.2, z, 80.0) for z in (1.5, 1.9, 2.5, 3.6)]
+    depth, lenses = np.full(size, 2.0), [ThinLens(0.2, z, 80.0) for z in STACK_FOCI]
     stack = [
         np.asarray(dof.scatter(image, depth, lens)) + 0.005 * rng.normal(size=image.shape)
         for lens in lenses
@@ -255,3 +256,34 @@ def a_focal_stack_of_half_an_even_wall(_):
     }
     shown = np.where(told[..., None], np.asarray(found.depth)[..., None] / 4, 0)
     return Found(figures, np.concatenate([stack[1], shown * np.ones(3)], axis=0))
+
+
+@case(
+    "fit",
+    {"successes": 0.0, "off": None, "off by more than a tenth": None},
+    ("focal_stack",),
+    "none: a search stops at every step to report",
+)
+def a_focal_stack_of_a_fence_before_a_smooth_wall(_):
+    """Four images of bars, two pixels wide and a third as far as a wall whose colors vary over
+    some fifteen pixels: whether the fit calls itself a success, the median relative error of the
+    depth, and the share of it that is more than a tenth off. Planes take the wall for the
+    bars."""
+    rng, size = np.random.default_rng(5), (48, 48)
+    is_bar = np.broadcast_to(np.arange(48) % 12 < 2, size)
+    wall = blur.gaussian(rng.random((*size, 3)), sigma=6)
+    wall = np.asarray(0.5 + 0.15 * (wall - wall.mean()) / wall.std())
+    bars = rng.random((*size, 3)) * [0.7, 0.3, 0.3] + [0.3, 0, 0]
+    image, near, far = np.where(is_bar[..., None], bars, wall), 1.5, np.full(size, 4.5)
+    depth, lenses = np.where(is_bar, near, far), [ThinLens(0.5, z, 80.0) for z in STACK_FOCI]
+    stack = [dof.layered(image, depth, lens, behind=(wall, far)) for lens in lenses]
+    options = {"min_depth": 1.2, "max_depth": 6.0, "max_steps": 4, "throw": False}
+    found = fit.focal_stack(stack, lenses, **options)
+    off = np.abs(np.asarray(found.depth) / depth - 1)
+    figures = {
+        "successes": float(found.success),
+        "off": float(np.median(off)),
+        "off by more than a tenth": float(np.mean(off > 0.1)),
+    }
+    shown = np.asarray(found.depth)[..., None] / 6 * np.ones(3)
+    return Found(figures, np.concatenate([stack[0], shown], axis=1))
