@@ -266,7 +266,7 @@ def a_focal_stack_of_half_an_even_wall(_):
 )
 def a_focal_stack_of_a_fence_before_a_smooth_wall(_):
     """Four images of bars, two pixels wide and a third as far as a wall whose colors vary over
-    some fifteen pixels: whether the fit calls itself a success, the median relative error of the
+    some 15 pixels: whether the fit calls itself a success, the median relative error of the
     depth, and the share of it that is more than a tenth off. Planes take the wall for the
     bars."""
     rng, size = np.random.default_rng(5), (48, 48)
