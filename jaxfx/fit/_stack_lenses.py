@@ -24,7 +24,7 @@ from jaxfx._progress import Bar
 from jaxfx.fit._descent import descend
 from jaxfx.fit._jackknife import tiles
 from jaxfx.fit._reduction import reduced
-from jaxfx.fit._stack_planes import least_energy
+from jaxfx.fit._stack_planes import candidate_planes, least_energy
 
 
 Unknown = Literal["aperture", "focus_distance"]
@@ -33,7 +33,6 @@ Unknown = Literal["aperture", "focus_distance"]
 # below. With half as many planes apertures of two walls are found 2 % too small, which are
 # 0.3 % too small with these.
 _STEP = 0.5
-_MOST_PLANES = 96
 # Images are reduced as long as the largest circle of confusion stays above this many pixels.
 _LEAST_CIRCLE = 12
 # How much larger than the start's circles of confusion may be: for them images are mirrored
@@ -112,13 +111,12 @@ def searched(
     factor = max(1, int(ends.max() / _LEAST_CIRCLE))
     strengths, largest = start.strengths / factor, ends.max() / factor
     images = jnp.stack([reduced(image, factor) for image in images])
-    count = math.ceil(_LARGER * strengths.mean() * (bounds[1] - bounds[0]) / _STEP) + 1
     array = lambda values: jnp.asarray(values, images.dtype)
     misfit = _Misfit(
         images,
         array(strengths),
         array(start.foci),
-        array(np.linspace(*bounds, min(max(count, 8), _MOST_PLANES))),
+        array(candidate_planes(bounds, _LARGER * strengths.mean(), _STEP)),
         array(_turn(start.foci, unknown)),
         unknown,
         math.ceil(_LARGER * largest / 2) + 2,

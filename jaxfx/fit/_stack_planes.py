@@ -52,6 +52,9 @@ _REACH, _NEAR, _ALIKE = 4, 2.0, 0.3
 _TRUST = 2
 # Least energy, as a ratio to the mean: what fits to rounding does not outweigh all.
 _LEAST_ENERGY = 1e-6
+# Candidate planes: with fewer a smooth scene has no neighbors to compare; the memory is that of
+# as many images.
+_LEAST_PLANES, _MOST_PLANES = 8, 96
 
 
 class Planes(NamedTuple):
@@ -70,6 +73,18 @@ class Planes(NamedTuple):
     slope: Float[Array, "plane height width"]
     spread: Float[Array, "plane height width"]
     image: Float[Array, "plane height width channel"]
+
+
+def candidate_planes(
+    bounds: tuple[float, float], strength: float, step: float
+) -> Float[np.ndarray, " plane"]:
+    """Evenly spaced inverse depths from one bound to the other.
+
+    They are `step` pixels of defocus apart, or as far as so many planes allow; `strength` is in
+    pixels of defocus per inverse depth.
+    """
+    count = math.ceil(strength * (bounds[1] - bounds[0]) / step) + 1
+    return np.linspace(*bounds, min(max(count, _LEAST_PLANES), _MOST_PLANES))
 
 
 class _Stack:

@@ -36,6 +36,7 @@ from jaxfx.fit._stack_planes import (
     around,
     at_inverse_depth,
     best,
+    candidate_planes,
     compared,
     explained,
     settled,
@@ -57,8 +58,6 @@ _MOST_ENERGY_RATIO = 1.25
 # Pixels of defocus from one candidate plane to the next. Coarser planes miss the least energy,
 # finer ones cost time alone.
 _STEP = 0.35
-# Most candidate planes: the memory is that of as many images.
-_MOST_PLANES = 96
 # Pixels. Lenses whose circles of confusion differ less from one another tell no depth.
 _LEAST_DIFFERENCE = 0.5
 
@@ -236,8 +235,8 @@ def focal_stack(
             lines = _lines(lenses)
             bounds = _range(lines.foci, min_depth, max_depth)
             largest = _largest(lines, bounds)
-        count = math.ceil(lines.strengths.mean() * (bounds[1] - bounds[0]) / _STEP) + 1
-        candidates = jnp.linspace(*bounds, min(max(count, 8), _MOST_PLANES), dtype=dtype)
+        candidates = candidate_planes(bounds, lines.strengths.mean(), _STEP)
+        candidates = jnp.asarray(candidates, dtype)
         pad = math.ceil(largest / 2) + 2
         planes = compared(stack, *(jnp.asarray(x, dtype) for x in lines), candidates, pad)
         bar.step(planes=str(len(candidates)))
