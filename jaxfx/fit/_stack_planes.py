@@ -40,6 +40,9 @@ _BEYOND, _BEFORE = 8.0, 16.0
 # Power of the noise over that of the image in the quotient, a ratio. Larger blurs the image,
 # smaller lets the errors of one surface ring over others.
 _NOISE = 1e-2
+# Least steepness of residuals that tells a depth, as a ratio to that which noise has: so much
+# noise has by chance in 2 % of windows at most. With a ratio of 1 it is up to 29 %.
+_LEAST_STEEPNESS = 1.5
 
 
 # Of the weighted median: its reach, and the standard deviation of its weights by nearness, both
@@ -64,7 +67,8 @@ class Planes(NamedTuple):
       residuals times frequency, squared units of radiance. White noise has as much of both. It
       is divided by what unrelated images of unit power would leave, so that planes under which
       few images count can be compared with others.
-    - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise.
+    - `slope`: sum of squares of their derivatives in the inverse depth, less that of noise; 0
+      where noise may have as much.
     - `spread`: variance of the sum of residuals times derivatives.
     - `image`: the all-in-focus image if all were on the plane.
     """
@@ -177,7 +181,8 @@ def compared(
         steepness = jnp.sum(slope * slope, axis=over)
         score = _boxed(jnp.sum(residual * slope, axis=over)) / _BLOCK
         spread = windowed(score * score + floor * steepness)
-        told = jnp.maximum(windowed(steepness) - white * plain, 0)
+        steep, noise = windowed(steepness), white * plain
+        told = jnp.where(steep > _LEAST_STEEPNESS * noise, steep - noise, 0)
         return carry, Planes(stack.energy(plain, risen, left), told, spread, sharp)
 
     return scan(plane, None, candidates)[1]

@@ -54,6 +54,15 @@ def test_the_transform_of_a_disc_is_that_of_bessel():
     assert float(disc(jnp.zeros(1))[0]) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("noise", [0.005, 0.02])
+def test_noise_alone_tells_no_depth(noise):
+    rng = np.random.default_rng(3)
+    images = [0.5 + noise * rng.normal(size=(SIZE, SIZE, 1)) for _ in FOCI]
+    found = fit.focal_stack(images, LENSES, min_depth=1.2, max_depth=5.0, **QUICK)
+    assert float(found.share) < 0.04
+    assert "determine the depth" in found.doubt
+
+
 @pytest.mark.parametrize("depth", [1.8, 2.4, 3.3])
 def test_a_textured_wall(depth):
     """Closed form; its middle, for mirrored borders are not those of a periodic wall."""
