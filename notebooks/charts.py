@@ -58,7 +58,8 @@ show("dof_time_still_life", "dof_time_fence")
 #
 # - **Read along the front.** Each step up must be paid for. `blend` is the cheapest; the
 #   programs of `scatter` are one method at several prices, in one row; `layered` with a second
-#   layer of depth is as exact as some thirty passes, for a tenth of their time.
+#   layer of depth is as exact as some thirteen passes, for a tenth of their time, and with a
+#   guess of that layer as some ten.
 # - **The scenes disagree**, and the second is there for that. Behind a fence out of focus lies
 #   what no single image holds: methods of one layer end within four decibels of one another,
 #   and only a second layer or more passes get further.
