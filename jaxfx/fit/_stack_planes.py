@@ -55,8 +55,8 @@ _REACH, _NEAR, _ALIKE = 4, 2.0, 0.3
 _TRUST = 2
 # Least energy, as a ratio to the mean: what fits to rounding does not outweigh all.
 _LEAST_ENERGY = 1e-6
-# Candidate planes: with fewer a smooth scene has no neighbors to compare; the memory is that of
-# as many images.
+# Candidate planes. Between them the energy is a parabola, which few planes do not show; the
+# memory is that of as many images.
 _LEAST_PLANES, _MOST_PLANES = 8, 96
 
 
