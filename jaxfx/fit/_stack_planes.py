@@ -40,8 +40,9 @@ _BEYOND, _BEFORE = 8.0, 16.0
 # Power of the noise over that of the image in the quotient, a ratio. Larger blurs the image,
 # smaller lets the errors of one surface ring over others.
 _NOISE = 1e-2
-# Least steepness of residuals that tells a depth, as a ratio to that which noise has: so much
-# noise has by chance in 2 % of windows at most. With a ratio of 1 it is up to 29 %.
+# A ratio. Residuals tell a depth where their steepness in it is larger than this times what
+# noise alone has in the mean. With 1.5, noise tells a depth by chance in at most 2 % of the
+# pixels that were tried; with 1, in up to 29 %.
 _LEAST_STEEPNESS = 1.5
 
 
@@ -55,8 +56,8 @@ _REACH, _NEAR, _ALIKE = 4, 2.0, 0.3
 _TRUST = 2
 # Least energy, as a ratio to the mean: what fits to rounding does not outweigh all.
 _LEAST_ENERGY = 1e-6
-# Candidate planes. Between them the energy is a parabola, which few planes do not show; the
-# memory is that of as many images.
+# Numbers of candidate planes. A parabola is put through the energies of neighbors, which fewer
+# planes do not allow; more take more memory, that of an image each.
 _LEAST_PLANES, _MOST_PLANES = 8, 96
 
 
@@ -82,10 +83,11 @@ class Planes(NamedTuple):
 def candidate_planes(
     bounds: tuple[float, float], strength: float, step: float
 ) -> Float[np.ndarray, " plane"]:
-    """Evenly spaced inverse depths from one bound to the other.
+    """Evenly spaced inverse depths that are compared, from one bound to the other.
 
-    They are `step` pixels of defocus apart, or as far as so many planes allow; `strength` is in
-    pixels of defocus per inverse depth.
+    `strength` is how many pixels the defocus changes by per unit of inverse depth. Neighbors
+    differ by at most `step` pixels of defocus, or by more where that would take more than
+    `_MOST_PLANES` planes.
     """
     count = math.ceil(strength * (bounds[1] - bounds[0]) / step) + 1
     return np.linspace(*bounds, min(max(count, _LEAST_PLANES), _MOST_PLANES))
