@@ -19,6 +19,7 @@ from jaxfx._checks import (
     share,
 )
 from jaxfx._meshes import on_any_mesh
+from jaxfx._platform import kept
 from jaxfx._xla import sum_planes
 from jaxfx.dof.arguments import (
     OWN,
@@ -308,6 +309,8 @@ def _framed(x: Float[Array, "*plane height width"], beyond: int) -> Array:
     """A plane with its last pixels repeated, `beyond` times; cut off where it is negative."""
     if beyond < 0:
         return x[..., -beyond:beyond, -beyond:beyond]
+    # Kept in memory: else whatever adds up the derivative would repeat the sums at the edges.
+    x = kept(x)
     return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(beyond, beyond)] * 2, mode="edge")
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxfx._platform import by_platform, either
+from jaxfx._platform import by_platform, either, kept
 from jaxfx.dof.kernels._tiles import sum_all
 from jaxfx.dof.sprites import POINT_RADIUS, reach, row_half_width
 
@@ -24,7 +24,8 @@ def spoiled(
     radius = jax.lax.stop_gradient(jnp.where(bad, diameter / 2, POINT_RADIUS))
 
     # Not by a `cond` alone, which under `vmap` becomes a `select`, and computes both sides.
-    is_good = lambda bad, _: ~bad.any()
+    # Kept in memory: one kernel of the whole image and of this sum takes seconds to compile.
+    is_good = lambda bad, _: ~kept(bad).any()
     cover = ft.partial(_reached, reach(max_coc))
     return either(is_good, lambda bad, _: bad, cover, bad, radius)
 

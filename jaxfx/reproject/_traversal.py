@@ -68,10 +68,10 @@ _LANES = 64
 # at most three times those needed. A wrong value costs time only.
 _PACKING_RATIO = 3
 # Steps after which an accelerator's host checks whether any ray is unfinished. Each check waits
-# for the device; up to 3 steps are wasted at the end. A relief of 256 to 1024 pixels a side
+# for the device; up to 2 steps are wasted at the end. A relief of 256 to 1024 pixels a side
 # takes 6 to 21 steps in all. More steps between checks take longer to compile. A wrong value
 # costs time only.
-_STEPS_PER_CHECK = 4
+_STEPS_PER_CHECK = 3
 # Levels. A ray goes down by this many where it reaches a value. It goes up by one where it also
 # leaves the cell that lies this many levels above. Measured: a seventh fewer steps than with 1.
 # Any value gives the same hit.

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx._loops import scan
 from jaxfx._numerics import absolute, working_dtype
+from jaxfx._platform import kept
 from jaxfx._xla import apart
 from jaxfx.shadow.receivers import Receivers
 
@@ -27,6 +28,9 @@ Texels = Float[Array, "texels_down texels_across"]
 # Rows of taps. Filters of up to this many are unrolled; larger ones scan over rows, which
 # compiles sooner. The values are the same.
 _UNROLLED_ROWS = 9
+# On an accelerator, the rows whose sum is one kernel: the time to compile it grows with the
+# square of its taps.
+_ROWS_OF_A_KERNEL = 3
 # Texels. Rows of a window are read in multiples of this, the float32 numbers in a vector
 # register of 32 bytes. It matters for speed alone.
 _LANES = 8
@@ -250,8 +254,10 @@ def sum_rows(row: Any, size: int) -> Any:
     """The sum of `row(dy)` over the filter's rows; `dy` is a Python or a traced integer."""
     if size <= _UNROLLED_ROWS:
         total, *others = map(row, offsets(size))
-        for other in others:
+        for count, other in enumerate(others, start=2):
             total = jax.tree.map(jnp.add, total, other)
+            if count % _ROWS_OF_A_KERNEL == 0:
+                total = kept(total)
         return total
     zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(row, jnp.asarray(0, jnp.int32)))
     zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), zero)

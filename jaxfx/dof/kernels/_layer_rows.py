@@ -115,11 +115,11 @@ def _each_group(
         wide = _padded(extent, sheet)
         for start, groups, reach in runs:
 
-            def add_group(k, state, run=(start, reach), wide=wide, sheet=sheet, n=number):
+            def add_group(k, state, run=(start, reach), wide=wide, n=number):
                 start, reach = run
                 first = start + k * GROUP
                 arriving = _arriving(extent, wide, first, reach)
-                return visit(sheet, n, first, arriving, reach, state)
+                return visit(_cut(extent, wide), n, first, arriving, reach, state)
 
             # One run after the other, or all of them would take memory at once.
             wide, state = jax.lax.optimization_barrier((wide, state))
@@ -134,6 +134,13 @@ def _padded(extent: Extent, sheet: Sheets) -> Sheets:
     radius = pad(sheet.radius)
     value = pad(jnp.where(sheet.value[-1:] > 0, sheet.value, 0))
     return Sheets(value, jnp.where(radius > 0, radius, 1), pad(sheet.tilt), pad(sheet.place))
+
+
+def _cut(extent: Extent, wide: Sheets) -> Sheets:
+    """The sheet of a `_padded` one, without what that added: kept once in memory, not twice."""
+    beside = across_of(extent.reach) - extent.reach
+    cut = lambda x: x[..., : x.shape[-2] - _below(extent), beside : x.shape[-1] - beside]
+    return jax.tree.map(cut, wide)
 
 
 def _below(extent: Extent) -> int:
@@ -283,8 +290,8 @@ def _read_back(
     at_pixel = lambda x: x[None, :, None]
     of_sprite = lambda value, planes: ft.reduce(jnp.add, map(jnp.multiply, value, planes))
     # Kept in memory: a reduction would compute it again for every tap.
-    operands = sheet, share_of(_away(sheet, first)), [jnp.pad(bar, pad) for bar in bars]
-    sheet, shares, seen = jax.lax.optimization_barrier(operands)
+    operands = share_of(_away(sheet, first)), [jnp.pad(bar, pad) for bar in bars]
+    shares, seen = jax.lax.optimization_barrier(operands)
 
     def turn(index, sums):
         row = (index * rows - reach + jnp.arange(rows)).astype(dtype)
