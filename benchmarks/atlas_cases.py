@@ -162,7 +162,7 @@ def depth_of_field(at: Point) -> Case:
             "split, 1 guessed": of(dof.layered, mixed="split"),
             "split, 2 guessed": of(dof.layered, behind=("peel", "peel"), mixed="split"),
             "2 layers": lambda image, depth, lens, behind: dof.layered(
-                image, depth, lens, max_coc=coc, behind=behind
+                image, depth, lens, max_coc=coc, behind=[behind, None]
             ),
         },
         # The disc by the program of every other iris: the same image, another time.

@@ -81,7 +81,7 @@ def rows(case):
         )
         true = three = np.nan
         if case.behind is not None:
-            true, three = score(behind=case.behind), score(behind=[case.behind, "peel"])
+            true, three = score(behind=[case.behind, None]), score(behind=case.behind)
         yield name, largest, np.array([score(behind=None), score(behind="peel"), true, three])
 
 

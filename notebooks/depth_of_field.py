@@ -141,7 +141,7 @@ second = scene.gbuffer(room, camera, height=SIDE, width=SIDE, layer_index=1)
 behind = relight.render(second, camera, lights), second.depth
 second_layers = {
     "layered, one layer": program(ft.partial(dof.layered, behind=None)),
-    "layered, true second": program(ft.partial(dof.layered, behind=behind)),
+    "layered, true second": program(ft.partial(dof.layered, behind=[behind, None])),
 }
 for run in second_layers.values():
     jax.block_until_ready(run())
@@ -231,7 +231,8 @@ for share in (0.1, 0.5, 0.9):
         through(12 / float(glass.circle_of_confusion(distance).max()), focus, samples=32)
     )
 thresholds, curves = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0), {}
-for name, second in (("one layer", None), ("guessed second", "peel"), ("true second", hidden)):
+seconds = {"one layer": None, "guessed second": "peel", "true second": [hidden, None]}
+for name, second in seconds.items():
     draw = jax.jit(
         lambda glass, width, second=second: dof.layered(
             still, distance, glass, max_coc=12.01, threshold=width, behind=second

@@ -27,7 +27,7 @@ _Image = Float[ArrayLike, "height width channel"]
 _Plane = Num[ArrayLike, "height width"]
 _Given = tuple[_Image, _Plane] | tuple[_Image, _Plane, _Plane]
 # What the argument `behind` may be.
-Behind = _Given | Sequence[_Given | Literal["peel"]] | Literal["peel"] | None
+Behind = _Given | Sequence[_Given | Literal["peel"] | None] | Literal["peel"] | None
 
 
 class Layer(NamedTuple):
@@ -48,23 +48,27 @@ class Surface(NamedTuple):
 
 
 def given(name: str, behind: Any) -> list[Any]:
-    """The layers of an argument `behind`, front to back: `"peel"`, or tuples of arrays."""
+    """The layers of an argument `behind`, front to back: `"peel"`, or tuples of arrays.
+
+    What lies behind the last that is given is to be guessed, where None does not follow it.
+    """
     if behind is None:
         return []
     if isinstance(behind, str):
-        behind = [option(name, behind, ("peel",))]
+        return [option(name, behind, ("peel",))]
     expected = "a pair of an image and its depth, or a sequence of pairs"
     layers = items(name, behind, expected)
-    is_layer = lambda x: isinstance(x, tuple | list | str)
-    return layers if all(map(is_layer, layers)) else [tuple(layers)]
+    no_more = bool(layers) and layers[-1] is None
+    layers = layers[:-1] if no_more else layers
+    if not all(isinstance(x, tuple | list | str) for x in layers):
+        layers = [tuple(layers)]
+    are_guessed = [isinstance(x, str) and bool(option(name, x, ("peel",))) for x in layers]
+    return layers if no_more or not layers or are_guessed[-1] else [*layers, "peel"]
 
 
 def checked(function: str, image: Array, depth: Array, lens: Any, layer: Any) -> Layer:
     """A layer behind `image`: an image, its depth and, if given, its alpha; or `ValueError`."""
     name = f"{function}(behind=...)"
-    if isinstance(layer, str):
-        option(name, layer, ("peel",))
-        raise ValueError(f"`{name}` must hold images and depths, got {layer!r}.")
     if len(layer) not in (2, 3):
         raise ValueError(
             f"`{name}` must be an image and its depth, or those and alpha, "

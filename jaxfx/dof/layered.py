@@ -83,9 +83,9 @@ def layered(
     - `behind`: the next surface behind the first: a pair of an image and its depth, shaped as
       `image` and `depth`; the depth is inf where there is none, or as in `depth` where it is
       missing. Or `(image, depth, alpha)`: alpha, as below, then says where it is, and inf is
-      background. `"peel"` guesses it by `dof.peel`; None takes a single layer. A list or tuple
-      of those is several layers, front to back; `"peel"` in it guesses what lies behind all
-      before it.
+      background. `"peel"` guesses it by `dof.peel`. A list or tuple of those is several layers,
+      front to back. What the last one that is given hides is guessed as well, unless None
+      follows it: `[second, None]` is two layers, and None alone a single one.
     - `alpha`: height width, 0 to 1: how opaque the first layer is, of a matte or an antialiased
       edge. Colours are straight, not multiplied by it. Where it is 0 colour and depth may be
       anything. It needs a layer behind: where none is known, and none guessed, the colours of
@@ -155,7 +155,9 @@ def layered(
     focus that is "over".
 
     A guessed second layer repeats pixels from next to an edge. On 18 images of three scenes,
-    those that `peel` was made on, it gains 1.08 dB on average and loses 0.01 at most.
+    those that `peel` was made on, it gains 1.08 dB on average and loses 0.01 at most. A third
+    one, behind a true second, gains 0.007 dB there, more behind thin things that cross, loses
+    0.001 at most, and takes half as long again.
 
     Split pixels are those of two surfaces more than `threshold` apart, next to each other. The
     farther of the two goes into the first layer behind. The colours of both are means of near
@@ -197,18 +199,17 @@ def layered(
         lens = compiled("layered", own, depth)
     elif alpha is not None:
         alpha = share("layered(alpha=...)", alpha, depth.shape)
-        known = jnp.where(alpha < 1, 0, depth)
+        known = _opaque(depth, alpha)
     layers = []
     for item in given("layered(behind=...)", behind):
         chosen = item
-        if isinstance(item, str) and item == "peel":
-            in_front = [x[:2] for x in layers]
-            options = {"max_coc": max_coc, "threshold": threshold, "behind": in_front}
-            chosen = peel(pure, known, own, **options)
+        if isinstance(item, str):
+            chosen = peel(pure, known, own, max_coc=max_coc, threshold=threshold)
         layer = checked("layered", image, depth, own, chosen)
         if parts is not None and not layers:
             layer = checked("layered", image, depth, own, _before(parts, layer))
         layers.append(layer)
+        pure, known = layer.image, _opaque(layer.depth, layer.alpha)
     if parts is not None and not layers:
         layers = [checked("layered", image, depth, own, (parts.behind, parts.farther))]
     slices = None
@@ -272,6 +273,11 @@ def _layered(first, extent, behind, threshold, iris, margin, pad):
         late += clear * jnp.concatenate([own, jnp.ones_like(own[..., :1])], axis=-1)
     result = light[..., :-1] + (1 - light[..., -1:]) * late[..., :-1] / late[..., -1:]
     return jnp.where(inside(spoils)[..., None], jnp.nan, result).astype(first.image.dtype)
+
+
+def _opaque(depth: Array, alpha: Array | None) -> Array:
+    """A layer's depth, missing where something shows through it: nothing is guessed there."""
+    return depth if alpha is None else jnp.where(alpha < 1, 0, depth)
 
 
 def _before(parts: Split, layer: Layer) -> tuple[Array, ...]:

@@ -1,4 +1,4 @@
-"""The next layer of depth, hidden by those that are known, guessed from the image itself."""
+"""What a layer of depth hides, guessed from that layer itself."""
 
 import functools as ft
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
 from jaxfx._meshes import on_any_mesh
 from jaxfx.dof.arguments import check_arguments, defocused
-from jaxfx.dof.behind import Behind, Layer, checked, given
+from jaxfx.dof.behind import Layer
 from jaxfx.lens import Lens
 
 
@@ -31,9 +31,8 @@ def peel(
     *,
     max_coc: Number | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
-    behind: Behind = None,
 ) -> tuple[Float[Array, "height width channel"], Float[Array, "height width"]]:
-    """A guess of the surface behind the first, for `layered(behind=...)`, from one image.
+    """A guess of what a layer hides, for `layered(behind=...)`, from that layer alone.
 
     Next to an edge in depth a lens sees past the nearer surface. There the farther one is taken
     to go on, with the colour and depth that it has where the image shows it.
@@ -48,18 +47,16 @@ def peel(
       Outside `jit`, `grad` and `vmap` it may be left out and is then taken from `depth`.
     - `threshold`: pixels; a surface lies behind another if its defocus is larger by more than
       this. Give it and `layered` the same one.
-    - `behind`: layers that are known behind the first, as in `layered`. The guess is then what
-      lies behind the last one that a pixel has, and is taken from all of them.
 
     **Returns:** image and depth of the guess, in the types and shapes of the first. Where
     nothing is guessed the image is 0, and the depth 0, which is missing.
 
     **Raises:** `ValueError` for a wrong shape, an integer image, no lens, a negative
-    `threshold`, a layer `behind` that is none, or no `max_coc` under a transform.
+    `threshold`, or no `max_coc` under a transform.
 
-    **Gradient:** exact with respect to `image`, `depth` and `behind`, forward and reverse, for
-    the pixels that are taken: which ones those are is constant. Zero in `lens` and `threshold`,
-    which only choose them.
+    **Gradient:** exact with respect to `image` and `depth`, forward and reverse, for the pixels
+    that are taken: which ones those are is constant. Zero in `lens` and `threshold`, which only
+    choose them.
 
     **Example:**
 
@@ -90,10 +87,7 @@ def peel(
     image, depth, own, max_coc = check_arguments("peel", image, depth, lens, max_coc)
     threshold = parameter("peel(threshold=...)", threshold)
     check("peel(threshold=...)", threshold, lambda v: v >= 0, "0 or positive")
-    layers = [Layer(image, depth, own, None)]
-    for layer in given("peel(behind=...)", behind):
-        layers.append(checked("peel", image, depth, lens, layer))
-    return _peel(tuple(layers), max_coc, threshold)
+    return _peel(Layer(image, depth, own, None), max_coc, threshold)
 
 
 class Sources(NamedTuple):
@@ -106,48 +100,22 @@ class Sources(NamedTuple):
     right: Float[Array, "height width"]
     defocus: Float[Array, "height width"]
 
-    def square(self) -> Float[Array, "height width"]:
-        """Of the distance, in pixels; inf where there is no source."""
-        square = self.down * self.down + self.right * self.right
-        return jnp.where(self.defocus > -jnp.inf, square, jnp.inf)
-
 
 @ft.partial(jax.jit, static_argnames=("max_coc",))
-def _peel(layers, max_coc, threshold):
-    views = [defocused(x.image, x.depth, x.lens, max_coc) for x in layers]
-    defocus = jax.lax.stop_gradient(views[0].defocus)
-    threshold = jax.lax.stop_gradient(threshold).astype(defocus.dtype)
-    # In front of what is sought lies the last layer that a pixel has.
-    last, is_known = defocus, ~views[0].missing
-    for layer, view in zip(layers[1:], views[1:], strict=True):
-        is_there = jnp.isfinite(layer.depth) & ~view.missing
-        last = jnp.where(is_there, jax.lax.stop_gradient(view.defocus), last)
-        is_known |= is_there
-    found = [
-        _from(*layered, last, threshold, max_coc) for layered in zip(layers, views, strict=True)
-    ]
-    sources, color, farther = found[0]
-    for other, *rest in found[1:]:
-        is_nearer = other.square() < sources.square()
-        pairs = zip(other, sources, strict=True)
-        sources = Sources(*(jnp.where(is_nearer, x, y) for x, y in pairs))
-        color = jnp.where(is_nearer[..., None], rest[0], color)
-        farther = jnp.where(is_nearer, rest[1], farther)
-    is_found = (sources.defocus > -jnp.inf) & is_known
-    hidden = _without_streaks(color, sources.defocus, is_found, threshold)
-    farther = jnp.where(is_found, farther, 0)
-    return hidden.astype(layers[0].image.dtype), farther
-
-
-def _from(layer, view, last, threshold, max_coc):
-    """The sources in one layer of what lies behind `last`; their colours and depths."""
-    may_be_taken = jnp.isfinite(layer.depth) & ~(view.missing | view.bad)
+def _peel(layer, max_coc, threshold):
+    view = defocused(layer.image, layer.depth, layer.lens, max_coc)
     defocus = jax.lax.stop_gradient(view.defocus)
-    sources = _nearest_behind(last, may_be_taken, threshold, max_coc, defocus)
+    threshold = jax.lax.stop_gradient(threshold).astype(defocus.dtype)
+    may_be_taken = jnp.isfinite(layer.depth) & ~(view.missing | view.bad)
+    sources = _nearest_behind(defocus, may_be_taken, threshold, max_coc)
     height, width = defocus.shape
     row = jnp.arange(height)[:, None] + sources.down.astype(int)
     column = jnp.arange(width)[None] + sources.right.astype(int)
-    return sources, view.image[row, column], layer.depth[row, column]
+    is_found = (sources.defocus > -jnp.inf) & ~view.missing
+    color = view.image[row, column]
+    hidden = _without_streaks(color, sources.defocus, is_found, threshold)
+    farther = jnp.where(is_found, layer.depth[row, column], 0)
+    return hidden.astype(layer.image.dtype), farther
 
 
 def _nearest_behind(
@@ -155,14 +123,8 @@ def _nearest_behind(
     may_be_taken: Bool[Array, "height width"],
     threshold: Float[Array, ""],
     max_coc: float,
-    candidates: Float[Array, "height width"] | None = None,
 ) -> Sources:
-    """The nearest pixel, in the image, of those that lie behind each and show past it.
-
-    `defocus` is what lies in front; `candidates` that of the pixels that may be taken, by
-    default the same.
-    """
-    candidates = defocus if candidates is None else candidates
+    """The nearest pixel, in the image, of those that lie behind each and show past it."""
     lengths = [1] * (1 + _LAST_ROUNDS)
     while 2 * lengths[0] - 1 < max_coc:  # together they reach so far
         lengths.insert(0, 2 * lengths[0])
@@ -172,7 +134,7 @@ def _nearest_behind(
     none = jnp.full_like(defocus, -jnp.inf)
     far = lengths[0]
     padded = lambda x: jnp.pad(x, far, constant_values=-jnp.inf)
-    own = padded(jnp.where(may_be_taken, candidates, -jnp.inf))
+    own = padded(jnp.where(may_be_taken, defocus, -jnp.inf))
 
     def nearer(found, down, right, behind):
         """`found`, or the given sources where they are nearer and can be seen."""

@@ -177,7 +177,7 @@ class Model(eqx.Module):
         Both are photograph height width channel.
         """
         depth, behind = self.depths(values)
-
+        layers = "peel" if self.peels else None if behind is None else [behind, None]
         iris = self.shape(values)
 
         def draw(aperture, focus_distance, focal_pixels):
@@ -198,7 +198,7 @@ class Model(eqx.Module):
                     image,
                     depth,
                     lens,
-                    behind="peel" if self.peels else behind,
+                    behind=layers,
                     threshold=values["threshold"],
                     max_coc=self.max_coc,
                     iris=iris,

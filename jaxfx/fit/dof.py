@@ -180,8 +180,9 @@ def dof(
     - `gamma`, `epsilon`, `threshold`: where the search starts, a number and pixels twice.
     - `effect`: the function of `jaxfx.dof` whose parameters are sought.
     - `behind`: the second layer of `"layered"`, as there a pair of shapes height width channel
-      and height width. `"peel"` guesses it, for each lens that is tried; None fits through a
-      single layer. To draw what was fitted, give `dof.layered` the same `behind`, None too.
+      and height width; nothing is guessed behind it. `"peel"` guesses it, for each lens that is
+      tried; None fits through a single layer. To draw what was fitted, give `dof.layered` the
+      same, a pair as `[pair, None]`.
     - `iris`: the shape of the lens, where the search starts; by default the disc. `parameters`
       may then name its `rotation` (unless it is a disc) and `squeeze`, which start within a
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.
