@@ -299,7 +299,7 @@ def test_the_still_life(monkeypatch):
     example = importlib.util.spec_from_file_location("focal_stack_example", EXAMPLE)
     module = importlib.util.module_from_spec(example)
     example.loader.exec_module(module)
-    images, lenses, sharp, depth = module.rendered(96, module.SAMPLES)
+    images, lenses, sharp, depth = module.rendered(96, module.SAMPLES, aperture=0.1)
     found = fit.focal_stack(images, lenses, **module.RANGE, max_steps=8, throw=False)
     assert found.success, found.doubt
     table = module.compared(found, images, lenses, sharp, depth)
