@@ -276,7 +276,7 @@ def a_focal_stack_of_a_fence_before_a_smooth_wall(_):
     bars = rng.random((*size, 3)) * [0.7, 0.3, 0.3] + [0.3, 0, 0]
     image, near, far = np.where(is_bar[..., None], bars, wall), 1.5, np.full(size, 4.5)
     depth, lenses = np.where(is_bar, near, far), [ThinLens(0.5, z, 80.0) for z in STACK_FOCI]
-    stack = [dof.layered(image, depth, lens, behind=(wall, far)) for lens in lenses]
+    stack = [dof.layered(image, depth, lens, behind=[(wall, far), None]) for lens in lenses]
     options = {"min_depth": 1.2, "max_depth": 6.0, "max_steps": 4, "throw": False}
     found = fit.focal_stack(stack, lenses, **options)
     off = np.abs(np.asarray(found.depth) / depth - 1)
