@@ -58,9 +58,11 @@ def given(name: str, behind: Any) -> list[Any]:
         return [option(name, behind, ("peel",))]
     expected = "a pair of an image and its depth, or a sequence of pairs"
     layers = items(name, behind, expected)
-    no_more = bool(layers) and layers[-1] is None
-    layers = layers[:-1] if no_more else layers
-    if not all(isinstance(x, tuple | list | str) for x in layers):
+    is_layer = lambda x: isinstance(x, tuple | list | str)
+    no_more = bool(layers) and layers[-1] is None and all(map(is_layer, layers[:-1]))
+    if no_more:
+        layers = layers[:-1]
+    elif not all(map(is_layer, layers)):
         layers = [tuple(layers)]
     are_guessed = [isinstance(x, str) and bool(option(name, x, ("peel",))) for x in layers]
     return layers if no_more or not layers or are_guessed[-1] else [*layers, "peel"]

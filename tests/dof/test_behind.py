@@ -80,6 +80,7 @@ def test_a_third_layer_shows_past_the_second():
     assert error([second, "peel"]) < 0.01
     assert error(second) == error([second]) == error([second, "peel"])
     assert error([second, None]) > 0.03
+    assert error([None]) == error(None)
 
 
 @pytest.mark.parametrize("lens", [LENS, ThinLens(0.0, 2.0, 24.0)])
@@ -301,7 +302,14 @@ def test_faults_are_named():
     layered = inspect.unwrap(dof.layered)
     image, depth = texture(), np.full(SIZE, 2.0)
     pair = image, depth
-    for behind in (("peal",), [pair, "wall"], [None, pair], [pair, (image,)], [(pair, pair)]):
+    for behind in (
+        ("peal",),
+        [pair, "wall"],
+        [None, pair],
+        (*pair, None),
+        [pair, (image,)],
+        [(pair, pair)],
+    ):
         with pytest.raises(ValueError, match=r"`layered\(behind=...\)` must be "):
             layered(image, depth, LENS, behind=behind)
     with pytest.raises(ValueError, match=r"`layered\(alpha=...\)` must be in \[0, 1\]"):
