@@ -50,7 +50,7 @@ class Surface(NamedTuple):
 def given(name: str, behind: Any) -> list[Any]:
     """The layers of an argument `behind`, front to back: `"peel"`, or tuples of arrays.
 
-    What lies behind the last that is given is to be guessed, where None does not follow it.
+    `"peel"` is added where the last one is a tuple. None as the last item prevents that.
     """
     if behind is None:
         return []
@@ -64,8 +64,10 @@ def given(name: str, behind: Any) -> list[Any]:
         layers = layers[:-1]
     elif not all(map(is_layer, layers)):
         layers = [tuple(layers)]
-    are_guessed = [isinstance(x, str) and bool(option(name, x, ("peel",))) for x in layers]
-    return layers if no_more or not layers or are_guessed[-1] else [*layers, "peel"]
+    for word in (x for x in layers if isinstance(x, str)):
+        option(name, word, ("peel",))
+    ends = no_more or not layers or isinstance(layers[-1], str)
+    return layers if ends else [*layers, "peel"]
 
 
 def checked(function: str, image: Array, depth: Array, lens: Any, layer: Any) -> Layer:

@@ -84,7 +84,7 @@ def layered(
       `image` and `depth`; the depth is inf where there is none, or as in `depth` where it is
       missing. Or `(image, depth, alpha)`: alpha, as below, then says where it is, and inf is
       background. `"peel"` guesses it by `dof.peel`. A list or tuple of those is several layers,
-      front to back. What the last one that is given hides is guessed as well, unless None
+      front to back. Behind the last layer that is given one more is guessed, unless None
       follows it: `[second, None]` is two layers, and None alone a single one.
     - `alpha`: height width, 0 to 1: how opaque the first layer is, of a matte or an antialiased
       edge. Colours are straight, not multiplied by it. Where it is 0 colour and depth may be
@@ -155,9 +155,9 @@ def layered(
     focus that is "over".
 
     A guessed second layer repeats pixels from next to an edge. On 18 images of three scenes,
-    those that `peel` was made on, it gains 1.08 dB on average and loses 0.01 at most. A third
-    one, behind a true second, gains 0.007 dB there, more behind thin things that cross, loses
-    0.001 at most, and takes half as long again.
+    those that `peel` was made on, it gains 1.08 dB on average and loses 0.01 at most. A guessed
+    third layer behind a true second one gains 0.004 dB on average there and loses 0.0002 at
+    most; it takes half as much time again. Two guesses gain more where thin things cross.
 
     Split pixels are those of two surfaces more than `threshold` apart, next to each other. The
     farther of the two goes into the first layer behind. The colours of both are means of near
@@ -315,7 +315,8 @@ def _framed(x: Float[Array, "*plane height width"], beyond: int) -> Array:
     """A plane with its last pixels repeated, `beyond` times; cut off where it is negative."""
     if beyond < 0:
         return x[..., -beyond:beyond, -beyond:beyond]
-    # Kept in memory: else whatever adds up the derivative would repeat the sums at the edges.
+    # Kept in memory. Otherwise every accelerator kernel that reads the derivative of `x` would
+    # contain the sums over the repeated pixels again, and take seconds to compile.
     x = kept(x)
     return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(beyond, beyond)] * 2, mode="edge")
 

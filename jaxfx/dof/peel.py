@@ -1,4 +1,4 @@
-"""What a layer of depth hides, guessed from that layer itself."""
+"""A guess of the surface behind an edge in depth, made from the image in front of it."""
 
 import functools as ft
 from typing import NamedTuple
@@ -32,10 +32,11 @@ def peel(
     max_coc: Number | None = None,
     threshold: Float[ArrayLike, ""] | float = 2.0,
 ) -> tuple[Float[Array, "height width channel"], Float[Array, "height width"]]:
-    """A guess of what a layer hides, for `layered(behind=...)`, from that layer alone.
+    """A guess of the surface behind the first, for `layered(behind=...)`, from one image.
 
     Next to an edge in depth a lens sees past the nearer surface. There the farther one is taken
-    to go on, with the colour and depth that it has where the image shows it.
+    to go on, with the colour and depth that it has where the image shows it. The image may also
+    be a second layer: the guess is then a third one.
 
     **Arguments:**
 

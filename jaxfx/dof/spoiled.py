@@ -24,7 +24,8 @@ def spoiled(
     radius = jax.lax.stop_gradient(jnp.where(bad, diameter / 2, POINT_RADIUS))
 
     # Not by a `cond` alone, which under `vmap` becomes a `select`, and computes both sides.
-    # Kept in memory: one kernel of the whole image and of this sum takes seconds to compile.
+    # Kept in memory. Otherwise an accelerator joins `any` with all that leads to `bad` in one
+    # kernel, which takes a second to compile.
     is_good = lambda bad, _: ~kept(bad).any()
     cover = ft.partial(_reached, reach(max_coc))
     return either(is_good, lambda bad, _: bad, cover, bad, radius)

@@ -28,8 +28,8 @@ Texels = Float[Array, "texels_down texels_across"]
 # Rows of taps. Filters of up to this many are unrolled; larger ones scan over rows, which
 # compiles sooner. The values are the same.
 _UNROLLED_ROWS = 9
-# On an accelerator, the rows whose sum is one kernel: the time to compile it grows with the
-# square of its taps.
+# Rows of taps in one kernel of an accelerator. The time to compile a kernel grows with the
+# square of its taps. A wrong value costs time only.
 _ROWS_OF_A_KERNEL = 3
 # Texels. Rows of a window are read in multiples of this, the float32 numbers in a vector
 # register of 32 bytes. It matters for speed alone.

@@ -137,7 +137,10 @@ def _padded(extent: Extent, sheet: Sheets) -> Sheets:
 
 
 def _cut(extent: Extent, wide: Sheets) -> Sheets:
-    """The sheet of a `_padded` one, without what that added: kept once in memory, not twice."""
+    """The sheet from which `_padded` made `wide`.
+
+    It is read out of `wide`, so that only one of the two takes memory.
+    """
     beside = across_of(extent.reach) - extent.reach
     cut = lambda x: x[..., : x.shape[-2] - _below(extent), beside : x.shape[-1] - beside]
     return jax.tree.map(cut, wide)
