@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Num
 from jaxfx._arrays import ArrayLike
 from jaxfx._checks import Number, check, parameter
 from jaxfx._meshes import on_any_mesh
+from jaxfx._platform import by_platform
 from jaxfx.dof.arguments import check_arguments, defocused
 from jaxfx.dof.behind import Layer
 from jaxfx.lens import Lens
@@ -163,7 +164,14 @@ def _nearest_behind(
         return nearer(found, theirs.down + down, theirs.right + right, theirs.defocus), None
 
     start = Sources(jnp.zeros_like(defocus), jnp.zeros_like(defocus), none)
-    return jax.lax.scan(step, start, steps)[0]
+    # An accelerator needs no copies of the planes between the steps of one length.
+    apart = lambda found, offset: jax.lax.optimization_barrier(step(found, offset))
+    return by_platform(
+        start,
+        steps,
+        cpu=lambda start, steps: jax.lax.scan(step, start, steps)[0],
+        accelerator=lambda start, steps: jax.lax.scan(apart, start, steps, unroll=8)[0],
+    )
 
 
 def _without_streaks(
