@@ -9,7 +9,7 @@ about the same defocus share, and the lens moves as these errors ask.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfx.fit._jackknife import principal
 
@@ -25,6 +25,10 @@ _RATIO, _PIXELS, _STRATA = 0.05, 0.28, 6
 # The least circle of confusion that is drawn as a disc, in pixels.
 _POINT = 1.0
 
+# A ratio to the root mean square of `widening` below which a pixel shows no blur. Rounding lies
+# below it, what blurs a texture above.
+_SHOWN = 1e-4
+
 
 @jax.jit
 def variances(
@@ -37,8 +41,9 @@ def variances(
     `columns` is the Jacobian at the solution, `widening` the derivative of the residual as all
     circles grow by one ratio, in its logarithm; `defocus` is NaN where it is missing.
     """
-    stratum = strata(defocus)
-    channels = widening.size // stratum.size
+    channels = widening.size // defocus.size
+    squares = jnp.sum(widening.reshape(*defocus.shape, channels) ** 2, axis=-1)
+    stratum = strata(defocus, squares > _SHOWN**2 * jnp.mean(squares))
     block = jnp.repeat(stratum.reshape(-1), channels)
     circle = jnp.repeat(jnp.nan_to_num(jnp.abs(defocus)).reshape(-1), channels)
     absolute = _PIXELS * widening / jnp.maximum(circle, _POINT)
@@ -50,24 +55,27 @@ def variances(
         ]
     )
     # The bound keeps what no pixel determines finite, and large.
-    squares = jnp.maximum(axes.squares, 64 * jnp.finfo(columns.dtype).eps)
-    moves = (errors / squares[None]) @ axes.basis.T
+    curvatures = jnp.maximum(axes.squares, 64 * jnp.finfo(columns.dtype).eps)
+    moves = (errors / curvatures[None]) @ axes.basis.T
     return jnp.sum(moves**2, axis=0)
 
 
 def strata(
     defocus: Float[Array, "photograph height width"],
+    shows_blur: Bool[Array, "photograph height width"],
 ) -> Int[Array, "photograph height width"]:
-    """The stratum of each pixel: sixths of a photograph's pixels, by their defocus.
+    """The stratum of each pixel: sixths, by defocus, of a photograph's pixels that show a blur.
 
     Equal values share a stratum. What lies before and what lies behind the focus have errors of
-    their own: only their difference moves a focus distance. All photographs show one scene, so
-    that a stratum has the same surfaces in each, and the same error.
+    their own: only their difference moves a focus distance. So an even background must not
+    count: if it were most of the image, all else would share one stratum. All photographs show
+    one scene, so that a stratum has the same surfaces in each, and the same error.
     """
     defocus = jnp.nan_to_num(defocus)
 
-    def ranked(own):
+    def ranked(own, counts):
         shares = jnp.arange(1, _STRATA, dtype=own.dtype) / _STRATA
-        return jnp.searchsorted(jnp.quantile(own, shares), own.reshape(-1), side="right")
+        bounds = jnp.nanquantile(jnp.where(counts, own, jnp.nan), shares)
+        return jnp.searchsorted(bounds, own.reshape(-1), side="right")
 
-    return jax.vmap(ranked)(defocus).reshape(defocus.shape)
+    return jax.vmap(ranked)(defocus, shows_blur).reshape(defocus.shape)

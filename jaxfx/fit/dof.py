@@ -64,7 +64,8 @@ class DofFit(eqx.Module):
     - `explained`: the share of the references' contrast, a ratio, that is explained in the
       pixels that count, times the share of those.
     - `clamped`: the share of pixels, a ratio, whose circle of confusion in the fitted lens is
-      larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`.
+      larger than `max_coc`. Above 0, the fit may be biased: repeat it with a larger `max_coc`,
+      unless those pixels are an even background.
     - `iris`: the shape with the numbers found; None where none was given.
     - `result`: optimistix' verdict, one of its `RESULTS`; it prints as a sentence.
     """
@@ -188,6 +189,8 @@ def dof(
       quarter of the angle between blades and at less than 1. Its roundness is never fitted.
     - `max_coc`: static; the largest diameter that may be drawn, in pixels; None for any. If
       given, it decides how small the images of the first searches are, else the start does.
+      Give one where an even background, far from the focus, has by far the largest circles:
+      they show nothing, and take most of the time.
     - `weights`: height width, no unit: how much the square of each pixel's difference counts;
       0 leaves a pixel out.
     - `loss`: `"robust"`, or `"squares"` for images that the effect itself made: all pixels

@@ -35,12 +35,30 @@ def test_the_variances_are_those_of_solving_again_with_each_error(apart):
 
 def test_equal_defocus_shares_a_stratum_and_missing_depth_spoils_none():
     plane = np.full((1, 6, 6), 3.0)
-    assert np.unique(_circle_error.strata(jnp.asarray(plane))).size == 1
+    is_shown = jnp.ones(plane.shape, bool)
+    assert np.unique(_circle_error.strata(jnp.asarray(plane), is_shown)).size == 1
     plane[0, 0, 0] = np.nan
     rng = np.random.default_rng(1)
     columns, widening = rng.normal(size=(36, 2)), rng.normal(size=36)
     found = _circle_error.variances(*map(jnp.asarray, (columns, widening, plane)))
     assert np.isfinite(found).all() and (np.asarray(found) > 0).all()
+
+
+@pytest.mark.parametrize("rounding", [0, 1e-7])
+def test_an_even_background_changes_no_error(rounding):
+    """Five sixths of an image that no lens changes, all at one defocus."""
+    rng = np.random.default_rng(2)
+    columns, widening = rng.normal(size=(120, 3)), rng.normal(size=120)
+    defocus = rng.uniform(-6, 6, (1, 10, 12))
+    alone = _circle_error.variances(*map(jnp.asarray, (columns, widening, defocus)))
+    added = lambda values: rounding * rng.normal(size=(5 * len(values), *values.shape[1:]))
+    with_background = (
+        np.concatenate([columns, added(columns)]),
+        np.concatenate([widening, added(widening)]),
+        np.concatenate([defocus, np.full((1, 50, 12), 200.0)], axis=1),
+    )
+    found = _circle_error.variances(*map(jnp.asarray, with_background))
+    np.testing.assert_allclose(found, alone, rtol=1e-5 if rounding else 1e-12)
 
 
 @pytest.mark.full
