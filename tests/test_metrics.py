@@ -115,7 +115,7 @@ def test_ssim_in_float32_on_a_bright_ground(rng, window):
 
 
 def test_psnr_of_a_constant_error():
-    image = jnp.full((3, 4, 2), 0.25)
+    image = np.full((3, 4, 2), 0.25)
     np.testing.assert_allclose(metrics.psnr(image + 0.1, image), 20, rtol=1e-12)
     np.testing.assert_allclose(metrics.psnr(image + 0.1, image, data_range=10), 40, rtol=1e-12)
 
@@ -135,7 +135,8 @@ def test_psnr_mask_leaves_pixels_out(rng):
     expected = -10 * np.log10(np.mean((image - reference)[mask] ** 2))
     image[~mask] = np.nan
     np.testing.assert_allclose(metrics.psnr(image, reference, mask=mask), expected, rtol=1e-12)
-    gradient = jax.grad(metrics.psnr)(jnp.asarray(image), reference, mask=mask)
+    slope = jax.jit(jax.grad(lambda image: metrics.psnr(image, reference, mask=mask)))
+    gradient = np.asarray(slope(image))
     assert np.all(np.isfinite(gradient))
     assert np.all(gradient[~mask] == 0)
     assert np.all(gradient[mask] != 0)
@@ -149,9 +150,9 @@ def test_psnr_with_an_empty_mask_that_is_traced_is_nan(rng):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_equal_images(rng, dtype):
-    image = jnp.asarray(noise(rng)[0], dtype)
+    image = noise(rng)[0].astype(dtype)
     for function, best in ((metrics.psnr, np.inf), (metrics.ssim, 1)):
-        assert function(image, image) == best
+        assert float(function(image, image)) == best
 
         @jax.jit
         def both_modes(image, reference, function=function):
@@ -184,12 +185,13 @@ def test_gradients(rng, call):
 def test_gradient_of_every_pixel(rng, call):
     image, reference = rng.random((2, 13, 13, 1))
     both_modes = jax.jit(lambda *at: (jax.grad(call)(*at), jax.jacfwd(call)(*at)))
-    gradient, forward = both_modes(jnp.asarray(image), reference)
+    gradient, forward = both_modes(image, reference)
     step = 1e-5
     changes = step * np.eye(image.size).reshape(image.size, *image.shape)
     batch = jax.jit(jax.vmap(lambda change: call(image + change, reference)))
-    expected = (batch(changes) - batch(-changes)) / (2 * step)
-    np.testing.assert_allclose(gradient.ravel(), expected, rtol=1e-6, atol=1e-8)
+    after, before = np.asarray(batch(changes)), np.asarray(batch(-changes))
+    expected = (after - before) / (2 * step)
+    np.testing.assert_allclose(np.ravel(gradient), expected, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(forward, gradient, rtol=1e-10, atol=1e-14)
 
 
@@ -226,7 +228,7 @@ def test_transforms(rng, call):
 
 def test_types(rng):
     image, reference = noise(rng)
-    half = jnp.asarray(image, jnp.float16)
+    half = image.astype(np.float16)
     for function in (metrics.psnr, metrics.ssim):
         assert function(half, half).dtype == jnp.float32
         assert function(half, reference.astype(np.float32)).dtype == jnp.float32
