@@ -113,6 +113,7 @@ def check_slopes(function: Callable[..., Any], arguments: tuple, **tolerances: f
 
     `jax.test_util.check_grads` does the same and compiles each mode several times.
     """
+    arguments = jax.device_get(arguments)  # Steps are added by NumPy, where nothing compiles.
     value, push = jax.jit(function), jax.jit(functools.partial(jax.jvp, function))
     pull = jax.jit(lambda at, weight: jax.vjp(function, *at)[1](weight))
     check_jvp(value, push, arguments, **tolerances)
