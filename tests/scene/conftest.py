@@ -4,7 +4,6 @@ import subprocess
 import sys
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -37,15 +36,15 @@ def _cameras():
     pinhole = PinholeCamera.look_at(
         [1.0, 2.0, 6.0], [0.2, 0.1, 0.0], up=[0, 1, 0], fov_y=0.9, height=60, width=83
     )
-    skewed = PinholeCamera(
-        pinhole.intrinsics.at[0, 1].set(9.0).at[0, 0].mul(1.2), pinhole.world_from_camera
-    )
+    intrinsics = np.array(pinhole.intrinsics)
+    intrinsics[0, :2] = 1.2 * intrinsics[0, 0], 9.0
+    skewed = PinholeCamera(intrinsics, pinhole.world_from_camera)
     return {
         "pinhole": pinhole,
         "off-axis": pinhole.through_lens([0.7, -0.4], focus_distance=5.0),
         "skewed": skewed,
         "orthographic": OrthographicCamera(
-            11.0, jnp.array([40.0, 31.5]), pinhole.world_from_camera
+            11.0, np.array([40.0, 31.5]), pinhole.world_from_camera
         ),
     }
 
@@ -89,7 +88,7 @@ def straight():
     def make(height, scale=1.0):
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = 0.0, height / scale, 3.0
-        return OrthographicCamera(scale, jnp.zeros(2), pose)
+        return OrthographicCamera(scale, np.zeros(2), pose)
 
     return make
 
