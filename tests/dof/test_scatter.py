@@ -59,14 +59,14 @@ def random_scene(seed, height=9, width=11, channels=3):
     image = rng.random((height, width, channels))
     depth = rng.uniform(1.0, 8.0, (height, width))
     depth[rng.random((height, width)) < 0.2] = np.inf
-    return jnp.asarray(image), jnp.asarray(depth)
+    return image, depth
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_equals_the_loop(program):
     image, depth = random_scene(0)
     lens = ThinLens(0.1, 2.5, 60.0)
-    expected = loop(np.asarray(image), np.asarray(depth), lens, 1.3, 1.7)
+    expected = loop(image, depth, lens, 1.3, 1.7)
     result = dof.scatter(image, depth, lens, gamma=1.3, epsilon=1.7, program=program)
     # The loop's quadrature is good to about 1e-6.
     np.testing.assert_allclose(result, expected, atol=5e-6)
@@ -103,8 +103,8 @@ def test_a_point_of_light_keeps_its_energy_and_place(radius):
     largest = next(each for each in (8, 20, 40) if radius <= each)
     side = 2 * largest + 5
     size = 2 * side + 1
-    image = jnp.zeros((size, size, 1)).at[side, side].set(1.0)
-    depth = jnp.full((size, size), jnp.inf)
+    image, depth = np.zeros((size, size, 1)), np.full((size, size), np.inf)
+    image[side, side] = 1.0
     lens = ThinLens(1.0, 1.0, 2 * radius) if radius else ThinLens(0.0, 1.0, 1.0)
     blur = lambda image: dof.scatter(image, depth, lens, max_coc=2 * largest, program="shift")
     spread = np.asarray(blur(image))[..., 0]
@@ -112,7 +112,7 @@ def test_a_point_of_light_keeps_its_energy_and_place(radius):
     # Where nothing is cut by the frame, the weights are those of a full disc.
     middle = slice(side - math.ceil(radius) - 1, side + math.ceil(radius) + 2)
     assert spread[middle, middle].sum() == pytest.approx(spread.sum(), abs=1e-12)
-    np.testing.assert_allclose(blur(jnp.ones((size, size, 1))), 1, atol=1e-12)
+    np.testing.assert_allclose(blur(np.ones((size, size, 1))), 1, atol=1e-12)
     assert spread.sum() == pytest.approx(1, abs=1e-5)
     assert abs((spread * offset).sum()) < 1e-3
     assert abs((spread * offset[:, None]).sum()) < 1e-3
@@ -141,7 +141,7 @@ def test_radius_zero_to_two_has_no_jump():
 
 def test_in_focus_is_the_identity():
     image, _ = random_scene(4)
-    depth = jnp.full(image.shape[:2], 2.5)
+    depth = np.full(image.shape[:2], 2.5)
     np.testing.assert_allclose(
         dof.scatter(image, depth, ThinLens(0.3, 2.5, 99.0)), image, rtol=1e-15
     )
@@ -159,14 +159,15 @@ def test_constant_linear_and_mirrored(seed, gamma, epsilon):
     lens = ThinLens(0.1, 2.5, 60.0)
 
     def blur(image, depth=depth):
-        return dof.scatter(image, depth, lens, gamma=gamma, epsilon=epsilon, max_coc=10)
+        options = {"gamma": gamma, "epsilon": epsilon, "max_coc": 10}
+        return np.asarray(dof.scatter(image, depth, lens, **options))
 
-    np.testing.assert_allclose(blur(jnp.full_like(image, 0.7)), 0.7, atol=1e-12)
+    np.testing.assert_allclose(blur(np.full_like(image, 0.7)), 0.7, atol=1e-12)
     np.testing.assert_allclose(
         blur(2 * image + 3 * other), 2 * blur(image) + 3 * blur(other), atol=1e-12
     )
     # Not so transposed: the rim is exact by rows.
-    for flip in (jnp.fliplr, jnp.flipud):
+    for flip in (np.fliplr, np.flipud):
         np.testing.assert_allclose(
             blur(flip(image), flip(depth)), flip(blur(image)), atol=1e-12
         )
@@ -189,19 +190,22 @@ def test_any_size(shape, program):
 @first("program", PROGRAMS)
 def test_a_bad_pixel_spoils_what_it_can_reach_and_no_more(program):
     image, depth = random_scene(6, 31, 31)
-    depth = jnp.full_like(depth, 5.0)
+    depth = np.full_like(depth, 5.0)
     lens = ThinLens(0.1, 2.5, 200.0)  # C = 4, so two pixels and a half
     rows, columns = np.mgrid[:31, :31] - 15
     blur = jax.jit(lambda i, d: dof.scatter(i, d, lens, max_coc=8, program=program))
     good = np.asarray(blur(image, depth))
-    for bad in (jnp.nan, jnp.inf, -jnp.inf):
-        result = blur(image.at[15, 15, 1].set(bad), depth)
+    for bad in (np.nan, np.inf, -np.inf):
+        wrong = image.copy()
+        wrong[15, 15, 1] = bad
+        result = np.asarray(blur(wrong, depth))
         spoiled = np.isnan(result).all(axis=-1)
         assert spoiled[15, 15]
         assert not spoiled[np.hypot(rows, columns) > 2 + np.sqrt(0.5)].any()
         lost = np.hypot(rows, columns) > 5
         np.testing.assert_allclose(result[lost], good[lost], atol=1e-12)
-    result = blur(image, depth.at[15, 15].set(jnp.nan))
+    depth[15, 15] = np.nan
+    result = np.asarray(blur(image, depth))
     assert not np.isnan(result[np.hypot(rows, columns) > 4 + np.sqrt(0.5)]).any()
 
 
@@ -219,7 +223,7 @@ def test_indicator_costs_energy_that_area_keeps():
     options = {"gamma": 1.0, "max_coc": 8, "program": "segment_sum"}
     area = dof.scatter(image, depth, lens, **options)
     indicator = dof.scatter(image, depth, lens, coverage="indicator", **options)
-    difference = np.abs(area - indicator).max()
+    difference = np.abs(np.asarray(area) - np.asarray(indicator)).max()
     assert 0.1 < difference < 1
 
 
@@ -239,9 +243,9 @@ PARAMETERS = {
 def inputs_of(seed, dtype=jnp.float64):
     """Everything that scatter depends on, at a smooth point: equal depths stand at a kink."""
     image, depth = random_scene(seed)
-    depth = jnp.asarray(np.random.default_rng(seed).uniform(1.0, 8.0, depth.shape))
+    depth = np.random.default_rng(seed).uniform(1.0, 8.0, depth.shape)
     return jax.tree.map(
-        lambda x: jnp.asarray(x, dtype), PARAMETERS | {"image": image, "depth": depth}
+        lambda x: np.array(x, dtype), PARAMETERS | {"image": image, "depth": depth}
     )
 
 
@@ -275,17 +279,15 @@ def compiled(program, is_twice=False):
     return jax.jit(derivatives)
 
 
-SIGNS = jnp.asarray(np.sin(np.arange(9 * 11 * 3.0) ** 2).reshape(9, 11, 3))
+SIGNS = np.sin(np.arange(9 * 11 * 3.0) ** 2).reshape(9, 11, 3)
 
 
 @first("program", PROGRAMS)
 @pytest.mark.parametrize("name", [*PARAMETERS, "image", "depth"])
 def test_gradients(program, name):
     inputs = inputs_of(8)
-    direction = jax.tree.map(jnp.zeros_like, inputs)
-    direction[name] = jnp.asarray(
-        np.random.default_rng(9).uniform(0.5, 1, np.shape(inputs[name])), float
-    )
+    direction = jax.tree.map(np.zeros_like, inputs)
+    direction[name] = np.random.default_rng(9).uniform(0.5, 1, inputs[name].shape)
 
     def loss(t):
         moved = jax.tree.map(lambda x, dx: x + t * dx, inputs, direction)
@@ -316,9 +318,9 @@ def test_gradient_at_a_silhouette(program):
     near = np.broadcast_to(np.arange(11) < 5, (9, 11))
     planes = {"image": np.where(near, 0.9, 0.1)[..., None] * np.ones(3)}
     planes["depth"] = np.where(near, 1.6, 4.1)
-    inputs = jax.tree.map(lambda x: jnp.asarray(x, float), PARAMETERS | planes)
-    zero = jax.tree.map(jnp.zeros_like, inputs)
-    along = {name: zero | {name: jnp.ones(())} for name in names}
+    inputs = jax.tree.map(lambda x: np.asarray(x, float), PARAMETERS | planes)
+    zero = jax.tree.map(np.zeros_like, inputs)
+    along = {name: zero | {name: np.ones(())} for name in names}
     edge = lambda picture: np.asarray(picture)[4, 2:9].mean(axis=-1)
     run = compiled(program, True)
     for name in names:
@@ -328,7 +330,8 @@ def test_gradient_at_a_silhouette(program):
         forward = edge(run(inputs, along[name], SIGNS)[1][0])
         np.testing.assert_allclose(forward, expected, rtol=1e-3, atol=1e-7)
         for k in range(7):
-            pixel = jnp.zeros((9, 11, 3)).at[4, 2 + k].set(1 / 3)
+            pixel = np.zeros((9, 11, 3))
+            pixel[4, 2 + k] = 1 / 3
             reverse = run(inputs, along[name], pixel)[0][1][name]
             np.testing.assert_allclose(reverse, forward[k], atol=1e-10)
 
@@ -351,10 +354,10 @@ def test_gradients_are_finite_where_they_degenerate(program, case, dtype):
     inputs = inputs_of(12, dtype)
     for name, value in DEGENERATE[case].items():
         if name == "depth":
-            inputs[name] = inputs[name].at[:, 3:].set(value)
+            inputs[name][:, 3:] = value
         else:
-            inputs[name] = jnp.asarray(value, dtype)
-    direction = jax.tree.map(jnp.ones_like, inputs)
+            inputs[name] = np.asarray(value, dtype)
+    direction = jax.tree.map(np.ones_like, inputs)
     run = compiled(program, dtype == jnp.float64)
     (blurred, gradient), (pushed, _) = run(inputs, direction, SIGNS.astype(dtype))
     for leaf in jax.tree.leaves((blurred, gradient, pushed)):
@@ -405,9 +408,9 @@ def test_focus_planes_are_a_lens():
 
 
 BAD = {
-    "image": ({"image": jnp.zeros((4, 5))}, "scatter\\(image\\).*(height, width, channel)"),
-    "integers": ({"image": jnp.zeros((4, 5, 3), int)}, "scatter\\(image\\).*floats.*int64"),
-    "depth shape": ({"depth": jnp.ones((5, 4))}, "scatter\\(depth\\).*\\(4, 5\\).*\\(5, 4\\)"),
+    "image": ({"image": np.zeros((4, 5))}, "scatter\\(image\\).*(height, width, channel)"),
+    "integers": ({"image": np.zeros((4, 5, 3), int)}, "scatter\\(image\\).*floats.*int64"),
+    "depth shape": ({"depth": np.ones((5, 4))}, "scatter\\(depth\\).*\\(4, 5\\).*\\(5, 4\\)"),
     "depth kind": ({"depth": "far.exr"}, "scatter\\(depth\\)` must be an array, got 'far.exr'"),
     "gamma": ({"gamma": -1.0}, "scatter\\(gamma=...\\)"),
     "epsilon": ({"epsilon": -1.0}, "scatter\\(epsilon=...\\)"),
@@ -421,7 +424,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_is_named(case):
     change, message = BAD[case]
-    arguments = {"image": jnp.ones((4, 5, 3)), "depth": jnp.ones((4, 5))} | change
+    arguments = {"image": np.ones((4, 5, 3)), "depth": np.ones((4, 5))} | change
     # The bare function: under test, jaxtyping would find a wrong shape first.
     with pytest.raises(ValueError, match=message):
         inspect.unwrap(dof.scatter)(**arguments, lens=ThinLens(0.1, 2.5, 60.0))
