@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from jaxfx import (
@@ -150,9 +149,8 @@ AROUND = [
 
 def points(camera, depth):
     """The world's points that a camera sees at a depth, in NumPy."""
-    depth = jnp.asarray(depth)
-    columns, rows = (jnp.arange(0.5, side) for side in depth.shape[::-1])
-    pixels = jnp.stack(jnp.meshgrid(columns, rows), axis=-1)
+    rows, columns = np.indices(np.shape(depth)) + 0.5
+    pixels = np.stack([columns, rows], axis=-1)
     return np.asarray(camera.unproject(pixels, depth))
 
 
