@@ -28,6 +28,7 @@ class Night:
         options = {"aperture": aperture, "focus_distance": FOCUS}
         self.lens = ThinLens.from_camera(self.camera, **options)
         self.depth = np.full(self.shape, WALL)
+        self.image = jax.jit(self.view)(self.camera)
 
     def view(self, camera):
         pixels = pixel_centers(*self.shape, camera.intrinsics.dtype)
@@ -39,16 +40,16 @@ class Night:
 
     def fitted(self, reference, **options):
         lens = self.lens
-        start = ThinLens(0.9 * lens.aperture, FOCUS, lens.focal_pixels)
+        start = ThinLens(0.9 * float(lens.aperture), FOCUS, lens.focal_pixels)
         coc = math.ceil(1.3 * float(lens.circle_of_confusion(WALL)))
         options = {"parameters": NAMES, "iris": START, "max_coc": coc} | options
-        return fit.dof(reference, self.view(self.camera), self.depth, start, **options)
+        return fit.dof(reference, self.image, self.depth, start, **options)
 
 
 def test_finds_the_iris_that_drew_the_image():
     night = Night(40, 0.7)
     options = {"iris": TRUTH, "gamma": 1.0}
-    photograph = dof.scatter(night.view(night.camera), night.depth, night.lens, **options)
+    photograph = dof.scatter(night.image, night.depth, night.lens, **options)
     found = night.fitted(photograph)
     assert found.success
     assert found.iris is not None
