@@ -1,6 +1,6 @@
 """Rays on a grid: where they come in, against small steps along each."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxfx.reproject import _crossings
@@ -13,8 +13,13 @@ def test_a_ray_comes_in_where_small_steps_first_find_it_inside():
     rng = np.random.default_rng(0)
     origin = rng.uniform(-8, 16, (600, 3))
     direction = rng.normal(size=(600, 3))
-    ends = (_crossings.coordinates(jnp.asarray(end)) for end in (origin, direction))
-    found = _crossings.entry_texel(_crossings.grid_rays(*ends), HEIGHT, WIDTH)
+
+    @jax.jit
+    def entry_texel(*ends):
+        rays = _crossings.grid_rays(*map(_crossings.coordinates, ends))
+        return _crossings.entry_texel(rays, HEIGHT, WIDTH)
+
+    found = entry_texel(origin, direction)
     times = np.linspace(0, 60, 60_001)
     seen = 0
     for o, d, x, y, inside in zip(origin, direction, *map(np.asarray, found), strict=True):
@@ -32,22 +37,18 @@ def test_a_ray_comes_in_where_small_steps_first_find_it_inside():
 
 
 def test_of_two_moments_at_one_time_the_one_before_comes_first():
-    at = lambda time, after: _crossings.Moment(jnp.asarray(time), jnp.asarray(after))
-    before, just_after = at(1.0, False), at(1.0, True)
-    assert _crossings.is_earlier(before, just_after) and not _crossings.is_earlier(
-        just_after, before
-    )
-    assert not _crossings.is_earlier(before, before)
-    assert _crossings.later(before, just_after).after
-    assert not _crossings.later(just_after, at(2.0, False)).after
+    is_earlier, later = jax.jit(_crossings.is_earlier), jax.jit(_crossings.later)
+    before, just_after = _crossings.Moment(1.0, False), _crossings.Moment(1.0, True)
+    assert is_earlier(before, just_after) and not is_earlier(just_after, before)
+    assert not is_earlier(before, before)
+    assert later(before, just_after).after
+    assert not later(just_after, _crossings.Moment(2.0, False)).after
 
 
 def test_a_ray_to_the_left_is_beyond_a_border_just_after_it():
-    moment = lambda after: _crossings.Moment(jnp.asarray(1.0), jnp.asarray(after))
+    texel_at = jax.jit(_crossings.texel_at)
     cell = lambda after, d, backward: int(
-        _crossings.texel_at(
-            moment(after), jnp.asarray(3.0 - d), jnp.asarray(d), jnp.asarray(backward)
-        )
+        texel_at(_crossings.Moment(1.0, after), 3.0 - d, d, backward)
     )
     assert cell(False, 1.0, False) == 3
     assert cell(False, -1.0, True) == 3
