@@ -125,6 +125,19 @@ def _circle_of_confusion(lens: Any, depth: Array) -> Array:
     return (scale * absolute(factor)).astype(depth.dtype)
 
 
+@one_program
+def _of_disparity(
+    strength: Array, scale: Array, focus_disparity: Array, shift: Array
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """The fields of `ThinLens.from_disparity`, and the inverse depth in focus."""
+    inverse_depth = scale * focus_disparity + shift
+    is_near = inverse_depth > 0
+    distance = jnp.where(is_near, 1 / jnp.where(is_near, inverse_depth, 1), jnp.inf)
+    # A disparity that is traced may turn out to have no depth: no lens has one either.
+    distance = jnp.where(inverse_depth < 0, jnp.nan, distance)
+    return (strength / scale, distance, jnp.ones_like(strength)), inverse_depth
+
+
 @final
 class ThinLens(eqx.Module):
     """A thin lens, by the three numbers that an image can tell.
@@ -388,14 +401,10 @@ class ThinLens(eqx.Module):
         name = "from_disparity(focus_disparity=...)"
         focus_disparity = parameter(name, focus_disparity)
         shift = parameter("from_disparity(shift=...)", shift)
-        inverse_depth = scale * focus_disparity + shift
+        fields, inverse_depth = _of_disparity(strength, scale, focus_disparity, shift)
         expected = "at a depth (scale * focus_disparity + shift >= 0)"
         check(name, inverse_depth, lambda v: (v >= 0) & np.isfinite(v), expected)
-        is_near = inverse_depth > 0
-        distance = jnp.where(is_near, 1 / jnp.where(is_near, inverse_depth, 1), jnp.inf)
-        # A disparity that is traced may turn out to have no depth: no lens has one either.
-        distance = jnp.where(inverse_depth < 0, jnp.nan, distance)
-        return cls(strength / scale, distance, jnp.ones_like(strength))
+        return cls(*fields)
 
     def _factors(self, depth: Array) -> tuple[Array, Array]:
         """The lens' factor of the defocus, never negative, and the depth's, with the sign."""

@@ -162,10 +162,20 @@ def ssim(
             f"`ssim(image)` must have at least {size} x {size} pixels for the {window} window, "
             f"got {image.shape[0]} x {image.shape[1]}."
         )
+    return _ssim_of_images(image, reference, data_range, window)
+
+
+@partial(jax.jit, static_argnums=3)
+def _ssim_of_images(
+    image: Float[Array, "h w c"],
+    reference: Float[Array, "h w c"],
+    data_range: Float[Array, ""],
+    window: str,
+) -> Float[Array, ""]:
+    """`ssim` of checked arguments."""
     # Channels side by side in a row: long rows are quicker than a short last axis.
     x, y = (a.reshape(a.shape[0], -1) for a in (image, reference))
-    fields = jnp.stack([x + y, x - y])
-    return jax.jit(_ssim, static_argnums=(2, 3))(fields, data_range, window, image.shape[2])
+    return _ssim(jnp.stack([x + y, x - y]), data_range, window, image.shape[2])
 
 
 def _taps(values: Array, count: int, axis: int, step: int) -> list[Array]:

@@ -494,10 +494,19 @@ class PinholeCamera(eqx.Module):
         offset = parameter("through_lens(offset)", offset, (2,)).astype(dtype)
         distance = parameter("through_lens(focus_distance=...)", focus_distance).astype(dtype)
         check("through_lens(focus_distance=...)", distance, lambda v: v > 0, "positive")
-        shear = self.intrinsics[:2, :2] @ offset / distance
-        intrinsics = self.intrinsics.at[:2, 2].add(shear)
-        axes = self.world_from_camera[:3, :2]
-        pose = self.world_from_camera.at[:3, 3].add(
-            axes @ offset.astype(self.world_from_camera.dtype)
+        return PinholeCamera(
+            *_moved_aside(self.intrinsics, self.world_from_camera, offset, distance)
         )
-        return PinholeCamera(intrinsics, pose)
+
+
+@one_program
+def _moved_aside(
+    intrinsics: Float[Array, "3 3"],
+    pose: Float[Array, "4 4"],
+    offset: Float[Array, "2"],
+    focus_distance: Float[Array, ""],
+) -> tuple[Float[Array, "3 3"], Float[Array, "4 4"]]:
+    """The fields of a camera moved along its x and y; what is in focus keeps its pixels."""
+    shear = intrinsics[:2, :2] @ offset / focus_distance
+    aside = pose[:3, :2] @ offset.astype(pose.dtype)
+    return intrinsics.at[:2, 2].add(shear), pose.at[:3, 3].add(aside)

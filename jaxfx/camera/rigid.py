@@ -145,10 +145,20 @@ def look_at_pose(eye: Any, at: Any, up: Any) -> Float[Array, "4 4"]:
     eye = parameter("look_at(eye)", eye, (3,))
     at = parameter("look_at(at)", at, (3,))
     up = parameter("look_at(up=...)", up, (3,))
-    forward = normalize(at - eye)
-    right = normalize(jnp.cross(forward, up))
+    pose, forward, right = _pose_towards(eye, at, up)
     check("look_at(at)", forward, lambda v: v.any(), "away from `eye`")
     check("look_at(up=...)", right, lambda v: v.any(), "off the direction of view")
+    return pose
+
+
+@one_program
+def _pose_towards(
+    eye: Float[Array, "3"], at: Float[Array, "3"], up: Float[Array, "3"]
+) -> tuple[Float[Array, "4 4"], Float[Array, "3"], Float[Array, "3"]]:
+    """The pose, and its axes ahead and to the right: 0 where there is no direction."""
+    forward = normalize(at - eye)
+    right = normalize(jnp.cross(forward, up))
     down = jnp.cross(forward, right)
     columns = jnp.stack([right, down, forward, eye], axis=1)
-    return jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
+    pose = jnp.concatenate([columns, jnp.array([[0, 0, 0, 1]], columns.dtype)])
+    return pose, forward, right
