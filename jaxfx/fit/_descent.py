@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxfx._checks import is_concrete
 from jaxfx._loops import cond, varying_as, while_loop
 from jaxfx._progress import Bar
-from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt, Linear, linearised
+from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt, Linear, Stages, linearised
 
 
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
@@ -88,6 +88,7 @@ def descend(
     patience: Any = PATIENCE,
     gain: Any = GAIN,
     every: int = 1,
+    radius: float = 1.0,
 ) -> End:
     """Search from a start for the least mean square of a residual.
 
@@ -96,11 +97,11 @@ def descend(
     that differ in the numbers alone share one. Without a `solver` it is Levenberg-Marquardt,
     which has also converged when `patience` steps in a row each lower the loss by less than
     `gain`, a ratio, and which computes derivatives once in `every` evaluations; for the others
-    the residual has a method `at`, which gives the same. A search that leaves the finite
-    numbers ends at the best unknowns before.
+    the residual has a method `at`, which gives the same. Its first step has the radius that is
+    given. A search that leaves the finite numbers ends at the best unknowns before.
     """
     patience = patience if solver is None else max_steps
-    solver = _default_solver(every) if solver is None else solver
+    solver = _default_solver(every, radius) if solver is None else solver
     fn = _Objective(residual, isinstance(solver, optx.AbstractMinimiser))
     if not is_concrete(residual, unknowns):
         return _descend_in_program(solver, fn, unknowns, max_steps, patience, gain)
@@ -192,14 +193,24 @@ class _Objective(eqx.Module):
     scalar: bool = eqx.field(static=True)
 
     def __call__(self, unknowns: Any, _: None) -> tuple[Array, Array]:
-        residual = self.residual(unknowns)
-        loss = jnp.mean(residual * residual)
+        residual, loss = _with_loss(self.residual(unknowns))
         return (loss if self.scalar else residual), loss
 
     def at(self, unknowns: Any, _: None) -> tuple[Array, Array]:
         """The same residual and loss as a call, without derivatives: by `residual.at`."""
-        residual = self.residual.at(unknowns)
-        return residual, jnp.mean(residual * residual)
+        return _with_loss(self.residual.at(unknowns))
+
+    def stages(self, unknowns: Any, _: None) -> Stages | None:
+        """The same residual and loss in two stages, where the residual has any."""
+        stages = getattr(self.residual, "stages", lambda _: None)(unknowns)
+        if stages is None:
+            return None
+        rest = lambda found, unknowns: _with_loss(stages.rest(found, unknowns))
+        return stages._replace(rest=rest)
+
+
+def _with_loss(residual: Array) -> tuple[Array, Array]:
+    return residual, jnp.mean(residual * residual)
 
 
 def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Linear:
@@ -208,8 +219,8 @@ def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Lin
 
 
 @functools.cache
-def _default_solver(every: int = 1) -> LevenbergMarquardt:
-    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, every=every)
+def _default_solver(every: int = 1, radius: float = 1.0) -> LevenbergMarquardt:
+    return LevenbergMarquardt(rtol=1e-4, atol=1e-5, every=every, radius=radius)
 
 
 _REST = {"args": None, "options": {}, "tags": frozenset()}

@@ -1,12 +1,13 @@
 """Images of a scene through lenses, as a function of the parameters that `fit.dof` seeks.
 
 A solver moves unknowns. `Model.values` turns them into parameters (aperture, focus distance and
-so on), `Model.__call__` parameters into images, drawn by `dof.scatter` or `dof.layered` and
-corrected by the footprint.
+so on), `Model.drawn` parameters into images, by `dof.scatter` or `dof.layered`, and
+`Model.corrected` adds the footprint to these.
 """
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -171,20 +172,16 @@ class Model(eqx.Module):
         circles = jnp.stack([lens.circle_of_confusion(depth) for lens in lenses])
         return jnp.where(depth > 0, circles, 0)
 
-    def __call__(self, values: Values) -> tuple[Array, Array]:
-        """The images that the effect draws, and those with the footprint that it lacks.
-
-        Both are photograph height width channel.
-        """
+    def drawn(self, values: Values) -> Float[Array, "photograph height width channel"]:
+        """The images that the effect draws. They don't depend on the footprint."""
         depth, behind = self.depths(values)
         layers = "peel" if self.peels else None if behind is None else [behind, None]
         iris = self.shape(values)
 
-        def draw(aperture, focus_distance, focal_pixels):
+        def draw(lens):
             image = self.images.image
-            lens = ThinLens(aperture, focus_distance, focal_pixels)
             if self.effect == "scatter":
-                drawn = scatter(
+                return scatter(
                     image,
                     depth,
                     lens,
@@ -193,27 +190,39 @@ class Model(eqx.Module):
                     max_coc=self.max_coc,
                     iris=iris,
                 )
-            else:
-                drawn = layered(
-                    image,
-                    depth,
-                    lens,
-                    behind=layers,
-                    threshold=values["threshold"],
-                    max_coc=self.max_coc,
-                    iris=iris,
-                )
-            if "footprint" not in self.names:
-                return drawn, drawn
-            coc = jnp.where(depth > 0, lens.circle_of_confusion(depth), 0)
-            return drawn, drawn + values["footprint"] * missing_blur(drawn, coc)
+            return layered(
+                image,
+                depth,
+                lens,
+                behind=layers,
+                threshold=values["threshold"],
+                max_coc=self.max_coc,
+                iris=iris,
+            )
 
-        focal_pixels = self.images.focal_pixels
-        apertures, focus_distances = (values[name] for name in LENS)
-        if focal_pixels.size == 1:
-            drawn, corrected = draw(apertures[0], focus_distances[0], focal_pixels[0])
-            return drawn[None], corrected[None]
-        return jax.vmap(draw)(apertures, focus_distances, focal_pixels)
+        return self._each(values, draw)
+
+    def corrected(
+        self, drawn: Float[Array, "photograph height width channel"], values: Values
+    ) -> Float[Array, "photograph height width channel"]:
+        """The images drawn with the footprint that the effect lacks."""
+        if "footprint" not in self.names:
+            return drawn
+        depth, _ = self.depths(values)
+
+        def correct(lens, drawn):
+            coc = jnp.where(depth > 0, lens.circle_of_confusion(depth), 0)
+            return drawn + values["footprint"] * missing_blur(drawn, coc)
+
+        return self._each(values, correct, drawn)
+
+    def _each(self, values: Values, function: Callable[..., Array], *images: Array) -> Array:
+        """`function(lens, *images)` for each photograph."""
+        lenses = [*(values[name] for name in LENS), self.images.focal_pixels]
+        of_photograph = lambda lens, *images: function(ThinLens(*lens), *images)
+        if self.images.focal_pixels.size == 1:
+            return of_photograph([x[0] for x in lenses], *(x[0] for x in images))[None]
+        return jax.vmap(of_photograph)(lenses, *images)
 
 
 def missing_blur(

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxfx.fit._descent import linear
 from jaxfx.fit._exposure import exposure_between
 from jaxfx.fit._lens_model import Model, Values
+from jaxfx.fit._levenberg_marquardt import Stages
 from jaxfx.fit._robust import huber
 
 
@@ -54,8 +55,12 @@ class Residual(eqx.Module):
 
     def compare(self, unknowns: Values) -> Comparison:
         """The images drawn at these unknowns, and how they differ from the photographs."""
+        return self._beside(self.model.drawn(self.model.values(unknowns)), unknowns)
+
+    def _beside(self, drawn: Array, unknowns: Values) -> Comparison:
+        """Drawn images beside the photographs."""
         images = self.model.images
-        drawn, corrected = self.model(self.model.values(unknowns))
+        corrected = self.model.corrected(drawn, self.model.values(unknowns))
         counts = images.weights[None] / (self.scale / self.unit) ** 2
 
         def exposed(drawn, reference, counts, scale):
@@ -81,6 +86,20 @@ class Residual(eqx.Module):
 
     def __call__(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
         return self.weighted(self.compare(unknowns).difference)
+
+    def stages(self, unknowns: Values) -> Stages | None:
+        """The same residual as a call, in two stages: the images drawn, and all else.
+
+        None if the images depend on all unknowns.
+        """
+        moving = {name: value for name, value in unknowns.items() if name != "footprint"}
+        if len(moving) == len(unknowns):
+            return None
+        return Stages(
+            moving,
+            lambda moving: self.model.drawn(self.model.values(unknowns | moving)),
+            lambda drawn, unknowns: self.weighted(self._beside(drawn, unknowns).difference),
+        )
 
     def at(self, unknowns: Values) -> Float[Array, "photograph height width channel"]:
         """The same residual as a call, by the compiled program of `evaluate`.

@@ -38,7 +38,7 @@ _SOFT, _RESTARTS = ("epsilon", "threshold"), (2.0, 0.5)
 
 # The largest side of the images on which searches begin, in pixels, and what their largest
 # circle of confusion must keep, in pixels: smaller circles show no lens.
-_COARSE, _LEAST_COC = 160, 5.0
+_COARSE, _LEAST_COC = 112, 5.0
 
 # Factors of the largest circle of confusion that is drawn: on the start's, for the lenses that
 # are compared; on that of the last end, for a search. A search whose circles outgrow the bound
@@ -54,6 +54,9 @@ _HANDICAP = 1.01
 _SOON = {"patience": 2, "gain": 1e-3}
 # When the last search has: each more step costs as much as all of a small image's.
 _LAST = {"patience": 3}
+# The radius of the first step on the images as given. The search begins near: with a radius
+# of 1 a third of its evaluations went by before steps were long enough.
+_NEAR = {"radius": 100.0}
 # Evaluations to one with derivatives, on images with a side of more than `_COARSE` pixels:
 # there derivatives are most of what a fit costs. With more a search ends farther from the
 # minimum; on small images, which decide what minimum it is, each evaluation has them.
@@ -112,11 +115,13 @@ class Search(NamedTuple):
         """The ends of searches from several starts."""
         return each(lambda start: self._refine(residual, start), starts, residual)
 
-    def _refine(self, residual: Residual, unknowns: Values, has_edges: bool = False) -> End:
+    def _refine(
+        self, residual: Residual, unknowns: Values, has_edges: bool = False, **when: Any
+    ) -> End:
         """A search whose end is another's start, at the noise of its own start."""
         if self.is_robust:
             residual = weighed(residual, unknowns, has_edges)
-        return self._solve(residual, unknowns, **_SOON)
+        return self._solve(residual, unknowns, **_SOON, **when)
 
     def _solve(self, residual: Residual, unknowns: Values, **when: Any) -> End:
         """`solve`, with derivatives at each evaluation or, on large images, at some."""
@@ -154,10 +159,10 @@ class Search(NamedTuple):
             model = self._with_bound(model, model.values(unknowns), _MARGIN)
             residual = self.residual(model)
             if self.is_robust:
-                end = self._refine(residual, unknowns, has_edges=True)
+                end = self._refine(residual, unknowns, has_edges=True, **_NEAR)
                 unknowns, losses = end.unknowns, losses + end.losses
                 residual = weighed(residual, unknowns, True)
-            end = self._solve(residual, unknowns, **_LAST)
+            end = self._solve(residual, unknowns, **_LAST, **_NEAR)
             unknowns, losses = end.unknowns, losses + end.losses
             circles = model.circles(model.values(unknowns))
             is_bounded = self.max_coc is not None
@@ -205,9 +210,12 @@ class Search(NamedTuple):
         if self.ratios:
             sizes = jnp.broadcast_to(sizes.sum(axis=1, keepdims=True), sizes.shape)
         table = [len(factor) for factor in factors]
-        order = jnp.stack([_lowest(column.reshape(table)) for column in sizes.T])
+        ranks = jnp.stack([_lowest(column.reshape(table)) for column in sizes.T], axis=1)
+        if is_concrete(ranks):
+            # Where there are fewer minima, no search is made twice.
+            ranks = jnp.asarray(list(dict.fromkeys(map(tuple, ranks.tolist()))))
         starts = []
-        for rank in order.T:
+        for rank in ranks:
             chosen = points[rank]  # photograph, name
             start = dict(origin)
             for name, values in zip(names, chosen.T, strict=True):

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -66,6 +67,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     that it tells the last change of the residual; the function then has a method `at`, which
     gives the same as a call, in less time than derivatives take.
 
+    `radius` is that of the first step. The larger, the nearer it is to one of Gauss and Newton:
+    near a minimum that saves the steps in which the radius grows.
+
     Source: Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters";
     Broyden 1965, "A class of methods for solving nonlinear simultaneous equations", for the
     correction. Our own: the triangle that stands for Jacobian and residual.
@@ -75,6 +79,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     atol: float
     norm: Callable[[Any], Array] = optx.max_norm
     every: int = 1
+    radius: float = 1.0
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """The state before the first step."""
@@ -88,7 +93,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             jnp.zeros(f_struct.size, f_struct.dtype),
             jnp.zeros((min(f_struct.size, columns), columns), unknowns.dtype),
             jax.tree.map(zeros, aux_struct),
-            jnp.ones((), unknowns.dtype),
+            jnp.full((), self.radius, unknowns.dtype),
             jnp.asarray(False),
             optx.RESULTS.successful,
             jnp.zeros((), jnp.int32),
@@ -135,18 +140,50 @@ class Linear(NamedTuple):
     aux: Any
 
 
+class Stages(NamedTuple):
+    """A function whose value costs most in a first stage, which some unknowns don't enter.
+
+    - `moving`: the entries of the unknowns, a dict, that enter it.
+    - `first(moving)`: its result, one array.
+    - `rest(found, unknowns)`: the function of that result and of all unknowns.
+    """
+
+    moving: dict[str, Any]
+    first: Callable[[Any], Array]
+    rest: Callable[[Array, Any], Any]
+
+
 @eqx.filter_jit
 def linearised(fn: Callable[[Any, Any], tuple[Array, Any]], y: Any, args: Any) -> Linear:
-    """A function that gives a residual and something beside it, linearised at `y`."""
-    flat, unravel = ravel_pytree(y)
+    """A function that gives a residual and something beside it, linearised at `y`.
 
-    def of_flat(flat):
-        residual, aux = fn(unravel(flat), args)
+    If it has a method `stages(y, args)` that gives `Stages`, no derivative of the first stage
+    is computed in an unknown that does not enter it. For other functions that gives None.
+    """
+    flat, unravel = ravel_pytree(y)
+    basis = varying_as(flat, jnp.eye(flat.size, dtype=flat.dtype))
+    stages: Stages | None = getattr(fn, "stages", lambda *_: None)(y, args)
+    if stages is None:
+
+        def of_flat(flat):
+            residual, aux = fn(unravel(flat), args)
+            return residual.reshape(-1), aux
+
+        residual, push, aux = jax.linearize(of_flat, flat, has_aux=True)
+        return Linear(residual, jax.vmap(push, out_axes=1)(basis), aux)
+
+    def of_both(found, flat):
+        residual, aux = stages.rest(found, unravel(flat))
         return residual.reshape(-1), aux
 
-    residual, push, aux = jax.linearize(of_flat, flat, has_aux=True)
-    basis = jnp.eye(flat.size, dtype=flat.dtype)
-    return Linear(residual, jax.vmap(push, out_axes=1)(varying_as(flat, basis)), aux)
+    moving, unravel_moving = ravel_pytree(stages.moving)
+    found, push_first = jax.linearize(lambda flat: stages.first(unravel_moving(flat)), moving)
+    residual, push_rest, aux = jax.linearize(of_both, found, flat, has_aux=True)
+    # In the order of `ravel_pytree`.
+    enters = np.concatenate([[name in stages.moving] * y[name].size for name in sorted(y)])
+    dots = jax.vmap(push_first)(basis[enters][:, enters])
+    found_dots = jnp.zeros((flat.size, *found.shape), found.dtype).at[enters].set(dots)
+    return Linear(residual, jax.vmap(push_rest, out_axes=1)(found_dots, basis), aux)
 
 
 @eqx.filter_jit

@@ -199,7 +199,7 @@ def dof(
     - `exposure`: `"equal"`, or `"free"`: gain and offset, by channel, are those that fit best.
     - `solver`: any least-squares solver or minimiser of optimistix. By default
       Levenberg-Marquardt, which has also converged where its steps gain next to nothing. On
-      images with a side of more than 160 pixels it computes derivatives once in four
+      images with a side of more than 112 pixels it computes derivatives once in four
       evaluations, and corrects them by what the others show (Broyden 1965).
     - `parameters`: the names to fit. By default those of the effect, `fit.PARAMETERS`
       (aperture, focus_distance, gamma, epsilon) or `fit.LAYERED_PARAMETERS` (aperture,
@@ -242,7 +242,7 @@ def dof(
     that differs by twenty standard deviations is left out, and so is one where the photograph
     is saturated: where a channel has its own largest value, with seven others at least. First,
     lenses of half to twice the aperture and 0.7 to 1.4 times the focus distance are compared on
-    images of at most 160 pixels a side. From the best two, and from half and twice the epsilon
+    images of at most 112 pixels a side. From the best two, and from half and twice the epsilon
     or the threshold, a search goes on there. The best end is searched from again with no
     footprint and with that of a photograph, and the better of both is refined on the images as
     given.

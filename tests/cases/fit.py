@@ -271,7 +271,7 @@ def a_focal_stack_of_a_fence_before_a_smooth_wall(_):
     bars."""
     rng, size = np.random.default_rng(5), (48, 48)
     is_bar = np.broadcast_to(np.arange(48) % 12 < 2, size)
-    wall = blur.gaussian(rng.random((*size, 3)), sigma=6)
+    wall = blur.gaussian(rng.random((*size, 3)), sigma=6.0)
     wall = np.asarray(0.5 + 0.15 * (wall - wall.mean()) / wall.std())
     bars = rng.random((*size, 3)) * [0.7, 0.3, 0.3] + [0.3, 0, 0]
     image, near, far = np.where(is_bar[..., None], bars, wall), 1.5, np.full(size, 4.5)

@@ -7,10 +7,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
+from jaxfx._platform import of_directions
 from jaxfx._progress import Bar
 from jaxfx.fit import _levenberg_marquardt as levenberg_marquardt
 from jaxfx.fit._descent import _begin, _Objective, _step, descend
-from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt
+from jaxfx.fit._levenberg_marquardt import LevenbergMarquardt, Stages, linearised
 from tests.helpers.forms import first
 
 
@@ -148,3 +149,77 @@ def test_a_step_that_is_not_finite_does_not_spoil_corrected_derivatives():
         y, state, _ = solver.step(residual, y, None, {}, state, frozenset())
     assert min(tried) < 0
     np.testing.assert_allclose(float(y["a"]), 1, rtol=1e-6)
+
+
+class InStages:
+    """A residual in two stages; `a` and `b` enter the first."""
+
+    def __init__(self):
+        self.directions = []
+
+        @jax.custom_jvp
+        def cubed(x):
+            return x**3
+
+        @cubed.defjvp
+        def _(primals, tangents):
+            (x,), (dot,) = primals, tangents
+            return cubed(x), of_directions(self._tangents)(x, dot[None])[0]
+
+        self.cubed = cubed
+
+    def _tangents(self, x, dots):
+        self.directions.append(len(dots))
+        return 3 * x[None] ** 2 * dots
+
+    def __call__(self, y, _):
+        return self._rest(self._first(y), y)
+
+    def stages(self, y, _):
+        moving = {name: y[name] for name in ("a", "b")}
+        return Stages(moving, self._first, self._rest)
+
+    def _first(self, y):
+        return self.cubed(jnp.outer(y["b"], jnp.arange(1.0, 4.0)) + y["a"])
+
+    def _rest(self, found, y):
+        residual = y["ahead"] * found + jnp.sin(y["a"] * y["past"])
+        return residual, jnp.sum(residual)
+
+
+def test_a_first_stage_is_differentiated_in_what_enters_it_alone():
+    # `ahead` comes between the others where unknowns are in a row.
+    y = {"a": 0.5, "ahead": 2.0, "b": [0.3, -0.7], "past": 1.5}
+    y = {name: jnp.asarray(value) for name, value in y.items()}
+    staged, rest = InStages(), {}
+    found = linearised(staged, y, rest)
+    assert set(staged.directions) <= {1, 3}
+
+    def numbers(flat):
+        a, ahead, b, past = flat[0], flat[1], flat[2:4], flat[4]
+        cubed = (b[:, None] * np.arange(1.0, 4.0) + a) ** 3
+        return (ahead * cubed + np.sin(a * past)).reshape(-1)
+
+    at, step = np.asarray([0.5, 2.0, 0.3, -0.7, 1.5]), 1e-6
+    np.testing.assert_allclose(found.residual, numbers(at), rtol=1e-12)
+    np.testing.assert_allclose(found.aux, numbers(at).sum(), rtol=1e-12)
+    slopes = [
+        (numbers(at + step * axis) - numbers(at - step * axis)) / (2 * step)
+        for axis in np.eye(5)
+    ]
+    np.testing.assert_allclose(found.jacobian, np.stack(slopes, axis=1), rtol=1e-7, atol=1e-8)
+
+
+def test_a_larger_first_radius_saves_steps_where_residuals_are_small():
+    x = np.linspace(-1, 2, 9)
+    small = Line(jnp.asarray(0.01 * x), jnp.asarray(0.01 * (2 * x + 1)))
+
+    def steps(radius):
+        start = {"a": jnp.asarray(0.0), "b": jnp.asarray(0.0)}
+        with Bar(False, "fit") as bar:
+            options = {"solver": None, "max_steps": 40, "radius": radius}
+            end = descend(small, start, bar=bar, **options)
+        np.testing.assert_allclose(end.unknowns["b"], 2, rtol=1e-2)
+        return len(end.losses)
+
+    assert steps(1e4) < steps(1.0)
