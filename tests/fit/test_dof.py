@@ -363,6 +363,15 @@ def test_wrong_pixels_do_not_decide():
     assert ends[0] == pytest.approx(TRUTH["aperture"], rel=0.02) and len(ends) >= 3
 
 
+def test_where_one_lens_looks_best_one_search_is_made():
+    reference, image, depth = picture()
+    begins = options(TRUTH | {"aperture": 1.4 * TRUTH["aperture"]})
+    seek = {"parameters": ("aperture",), "max_coc": 16, "loss": "squares"}
+    fitted = fit.dof(reference, image, depth, **begins, **seek)
+    assert len(fitted.ends) == 1
+    assert found(fitted)["aperture"] == pytest.approx(TRUTH["aperture"], rel=1e-3)
+
+
 @pytest.mark.full
 def test_gain_and_offset_are_found_beside_the_lens():
     reference, image, depth = picture()
