@@ -18,6 +18,7 @@ def moved(lens, field, by):
     return ThinLens(**(vars(lens) | {field: getattr(lens, field) + by}))
 
 
+@pytest.mark.full
 def test_the_example_runs(tmp_path, monkeypatch):
     (code,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     monkeypatch.chdir(tmp_path)
