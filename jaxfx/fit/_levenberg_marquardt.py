@@ -28,6 +28,8 @@ from jaxfx._loops import varying_as
 # next one may be longer by a factor if it falls by the other; else it is shorter. From Gould,
 # Orban, Sartenaer & Toint 2005, "Sensitivity of trust-region algorithms to their parameters".
 _ACCEPTED, _GOOD, _LONGER, _SHORTER = 0.01, 0.99, 3.5, 0.25
+# A step is made longer by at most this factor where the loss bends less than is expected.
+_LONGEST = 3.0
 
 
 _RESULTS: Any = optx.RESULTS
@@ -63,16 +65,18 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     It has converged where an accepted step changes unknowns and residual by less than
     `atol + rtol * abs(value)`, each of them.
 
-    Derivatives are computed once in `every` evaluations. The others correct the Jacobian so
-    that it tells the last change of the residual; the function then has a method `at`, which
-    gives the same as a call, in less time than derivatives take.
+    Derivatives are computed once in `every` evaluations. The others correct the Jacobian by the
+    last change of the residual; the function then has a method `at`, which gives the same as a
+    call, in less time than derivatives take. Such a search makes steps longer where the loss
+    bends less than the Jacobian tells.
 
     `radius` is that of the first step. The larger, the nearer it is to one of Gauss and Newton:
     near a minimum that saves the steps in which the radius grows.
 
     Source: Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters";
     Broyden 1965, "A class of methods for solving nonlinear simultaneous equations", for the
-    correction. Our own: the triangle that stands for Jacobian and residual.
+    correction, of which we take twice. Our own: the triangle that stands for Jacobian and
+    residual, and longer steps.
     """
 
     rtol: float
@@ -191,8 +195,10 @@ def _corrected(y: Any, state: _State, residual: Array, aux: Any) -> Linear:
     """The residual at `state.tried` with a Jacobian that is corrected, not computed.
 
     Broyden's correction is the least change of the Jacobian after which the step from `y`
-    to `state.tried` changes the residual by as much as was evaluated. A step of length 0, or
-    to a residual that is not finite, corrects nothing.
+    to `state.tried` changes the residual by as much as was evaluated: the mean Jacobian of the
+    step. Twice that is the Jacobian at its end, of a residual that is quadratic along it.
+    Large residuals need it, since the slope of the loss is their product with the Jacobian. A
+    step of length 0, or to a residual that is not finite, corrects nothing.
     """
     moved = ravel_pytree(state.tried)[0] - ravel_pytree(y)[0]
     residual = residual.reshape(-1)
@@ -201,7 +207,7 @@ def _corrected(y: Any, state: _State, residual: Array, aux: Any) -> Linear:
     is_told = (square > 0) & jnp.all(jnp.isfinite(missed))
     per_missed = jnp.where(is_told, moved / jnp.where(square > 0, square, 1), 0)
     correction = jnp.where(is_told, missed, 0)[:, None] * per_missed[None]
-    return Linear(residual, state.jacobian + correction, aux)
+    return Linear(residual, state.jacobian + 2 * correction, aux)
 
 
 @eqx.filter_jit
@@ -243,6 +249,9 @@ def _after(
         triangle = chosen(triangle, state.triangle)
     here = chosen(tried, here)
     step = _damped(triangle, radius)
+    if solver.corrects:
+        longer = _lengthened(step, moved, state, residual, jacobian)
+        step = jnp.where(accepted & ~state.is_first, longer, step)
     is_finite = jnp.all(jnp.isfinite(step))
     result = _RESULTS.where(is_finite, _RESULTS.successful, _RESULTS.singular)
     after = _State(
@@ -260,6 +269,33 @@ def _after(
     # What is reported belongs to the unknowns before the step.
     before = jax.tree.map(lambda *x: jnp.where(state.is_first, *x), aux, state.aux)
     return unravel(here), after, before
+
+
+def _lengthened(
+    step: Float[Array, " unknown"],
+    moved: Float[Array, " unknown"],
+    before: _State,
+    residual: Float[Array, " residual"],
+    jacobian: Float[Array, "residual unknown"],
+) -> Float[Array, " unknown"]:
+    """The next step, longer where it goes on as the last one did and the loss bends less.
+
+    Where residuals are large at the minimum, the loss may bend much less than the Jacobian
+    tells, and each step goes the same part of what is left. The change of the residual by the
+    last step, `moved`, tells how much it bends along that step. The part of the next step
+    along it is multiplied by the ratio of both curvatures, at most by `_LONGEST`.
+
+    `residual` and `jacobian` are those at the end of the last step, `before` is the state at
+    its beginning. A step is subtracted from the unknowns.
+    """
+    changed = residual - before.residual
+    expected = jnp.sum(changed * changed)
+    bend = expected + 2 * jnp.sum((changed - before.jacobian @ moved) * before.residual)
+    is_bent = bend * _LONGEST > expected
+    ratio = jnp.where(is_bent, expected / jnp.where(is_bent, bend, 1), _LONGEST)
+    along = jnp.sum(changed * (jacobian @ step)) / jnp.where(expected > 0, expected, 1)
+    goes_on = (expected > 0) & (along < 0) & (ratio > 1)
+    return step + jnp.where(goes_on, (ratio - 1) * along, 0) * moved
 
 
 def _triangle(matrix: Float[Array, "row column"]) -> Float[Array, "few column"]:

@@ -135,6 +135,30 @@ def test_corrected_derivatives_lead_to_the_same_minimum(monkeypatch):
     )
 
 
+def test_steps_are_longer_where_a_large_residual_bends_the_loss_less():
+    # Example 10.2.4 of Dennis & Schnabel 1983, "Numerical Methods for Unconstrained
+    # Optimization and Nonlinear Equations": the minimum is at 0, where the loss bends by
+    # 1 - 0.6 of what the Jacobian tells, so that each step leaves 0.6 of the way.
+    def residual(y, _=None):
+        return jnp.stack([y["a"] + 1, 0.6 * y["a"] ** 2 + y["a"] - 1]), jnp.zeros(())
+
+    residual.at = residual
+
+    def steps(every):
+        solver = LevenbergMarquardt(rtol=1e-7, atol=1e-7, every=every, radius=1e4)
+        y = {"a": jnp.asarray(0.5)}
+        state = solver.init(residual, y, None, {}, jnp.zeros(2), jnp.zeros(()), frozenset())
+        count = 0
+        while not state.has_converged:
+            y, state, _ = solver.step(residual, y, None, {}, state, frozenset())
+            count += 1
+        np.testing.assert_allclose(float(y["a"]), 0, atol=1e-6)
+        return count
+
+    assert steps(every=1) > 25
+    assert steps(every=4) < 12
+
+
 def test_a_step_that_is_not_finite_does_not_spoil_corrected_derivatives():
     # The logarithm of a negative number, whose derivative is finite and wrong, and a root's,
     # which is not finite. Steps from 9 are long enough.
