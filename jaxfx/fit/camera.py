@@ -186,8 +186,8 @@ def camera(
     The scene must be lit alike in both images, but for their exposure. The search finds the
     nearest minimum: a texture that repeats, or a start that is too far, may lead to a wrong
     one. Four pairs of photographs of a room with depth, 160 x 120 pixels, 1.5 to 7.7 degrees
-    and 5 to 26 cm apart, were all registered from the pose of `camera`: to 0.04 to 0.08 degrees
-    and 2 to 4 mm, with `reference_depth` to 0.02 degrees and 0.5 mm; likewise where one image
+    and 5 to 26 cm apart, were all registered from the pose of `camera`: to 0.02 to 0.08 degrees
+    and 1 to 3 mm, with `reference_depth` to 0.02 degrees and 0.5 mm; likewise where one image
     was a quarter brighter or darker.
 
     Source: Lucas & Kanade 1981, image registration, from coarse to fine; Murray, Li & Sastry
