@@ -1,8 +1,8 @@
 """Poses of RGB-D pairs against Open3D and OpenCV, in one run: time, and how far off each is.
 
 `pytest --benchmark-only -s benchmarks/test_fit_speed.py` prints the medians over rooms. The
-peers come with the extra `bench`; Open3D, which has no wheel for every Python, is left out
-where it can't be imported. They take both depths and grey images of 8 bits.
+peers come with the extra `bench`; one that is not installed is left out. They take both depths
+and grey images of 8 bits.
 """
 
 import functools

@@ -61,16 +61,25 @@ def pytest_collection_modifyitems(config, items):
     """Leave out what only `--full` runs, unless its folder, its file or a marker was named."""
     is_named, takes_all = _named(config), _takes_all(config)
 
+    def is_marked(item):
+        return bool(item.get_closest_marker("full"))
+
+    def is_full(item):
+        return is_marked(item) or item.path.parent.name in FULL_FOLDERS
+
     def is_left_out(item):
-        folder, marked = item.path.parent.name, bool(item.get_closest_marker("full"))
         if is_named(item.path):
             return False
-        return (folder == AGAIN and marked) if takes_all else marked or folder in FULL_FOLDERS
+        if takes_all:
+            return is_marked(item) and item.path.parent.name == AGAIN
+        return is_full(item)
 
     left_out = {item for item in items if is_left_out(item)}
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
+    if not any(map(is_full, items)):
+        compiling.use_older_generator()
     items.sort(key=lambda item: item.path.name != LONGEST)
 
 
