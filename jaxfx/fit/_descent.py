@@ -238,8 +238,12 @@ def _initial_state(solver: Any, fn: _Objective, y: Any) -> Any:
 
 def _begin(solver, fn, y):
     """The state before the first step; of other solvers' states, the arrays."""
-    state = _initial_state if _is_ours(solver) else _arrays_of_initial_state
+    state = _compiled_initial_state if _is_ours(solver) else _arrays_of_initial_state
     return state(solver, fn, y)
+
+
+# Compiled so that the residual is traced for its shape once, not at every search.
+_compiled_initial_state = eqx.filter_jit(_initial_state)
 
 
 def _step(solver, fn, y, state):

@@ -24,6 +24,9 @@ _WIDEST = 1 / 16
 # square.
 _COARSE = 160
 
+# Of such smaller images, one pixel in this many is compared along either axis.
+_STRIDE = 2
+
 # Pixels of the reference in the last steps, about; more make them slower and the pose surer.
 _PIXELS = 160 * 120
 
@@ -50,11 +53,7 @@ def search(
 
     Returns the residual of the last search and where that ended, with the losses of all.
     """
-    is_known = jnp.isfinite(views.depth) & (views.depth > 0)
-    known = jnp.where(is_known, views.depth, jnp.nan)
-    is_near = known <= _SKY * jnp.nanquantile(known, _NEAR)
-    median_depth = jnp.nanmedian(jnp.where(is_near, known, jnp.nan)).astype(float)
-    unit = jnp.concatenate([jnp.full(3, median_depth), jnp.ones(3, float)])
+    unit = jnp.concatenate([jnp.full(3, _unit(views.depth)), jnp.ones(3, float)])
 
     def model(views: Views, sigma: Any, twist: Array, stride: int = 1) -> Residual:
         """The residual of images blurred by `sigma`, with the scale of noise at the twist.
@@ -72,11 +71,13 @@ def search(
         return eqx.tree_at(lambda m: m.scale, first, _scale(compared(first, twist)))
 
     small = _small(views)
+    # The last steps on the given images make up for what these leave out.
+    stride = 1 if small is views else _STRIDE
     twist, losses = varying_as(views, jnp.zeros(6, float)), []
     sharpest, *coarse = reversed(_sigmas(min(small.reference.shape[:2])))
 
     def sharpened(twist: Array, sigma: Any) -> tuple[Array, list[Array]]:
-        end = descend_on(model(small, sigma, twist), twist, **_SOON)
+        end = descend_on(model(small, sigma, twist, stride), twist, **_SOON)
         return end.unknowns, end.losses
 
     if is_concrete(views):
@@ -87,7 +88,7 @@ def search(
         sigmas = jnp.asarray(coarse[::-1], views.source.intrinsics.dtype)
         twist, (steps, ends) = scan(sharpened, twist, sigmas)
         losses.append(jnp.concatenate([steps, ends[:, None]], axis=1))
-    last = model(small, sharpest, twist)
+    last = model(small, sharpest, twist, stride)
     if small is not views:
         end = descend_on(last, twist, **_SOON)
         twist, losses = end.unknowns, losses + end.losses
@@ -95,6 +96,24 @@ def search(
         last = model(views, sharpest, twist, math.ceil(math.sqrt(pixels / _PIXELS)))
     end = descend_on(last, twist, **_LAST)
     return last, end._replace(losses=losses + end.losses)
+
+
+@jax.jit
+def _unit(depth: Array) -> Float[Array, ""]:
+    """The unit of translations in scene units: the median depth of what is near.
+
+    Of the nearest known depth in each square of a reduced image: to sort all takes as long as
+    some steps of the search.
+    """
+    factor = math.ceil(max(depth.shape) / _COARSE)
+    is_known = jnp.isfinite(depth) & (depth > 0)
+    square = (factor, factor)
+    nearest = jax.lax.reduce_window(
+        jnp.where(is_known, depth, jnp.inf), jnp.inf, jax.lax.min, square, square, "SAME"
+    )
+    known = jnp.where(jnp.isfinite(nearest), nearest, jnp.nan)
+    is_near = known <= _SKY * jnp.nanquantile(known, _NEAR)
+    return jnp.nanmedian(jnp.where(is_near, known, jnp.nan)).astype(float)
 
 
 def _sigmas(side: int) -> list[float]:
