@@ -50,6 +50,13 @@ def verdict(result: optx.RESULTS) -> Any:
     return Verdict(index, optx.RESULTS)
 
 
+class Beside(NamedTuple):
+    """What comes beside a residual: its mean square, and what its function returns with it."""
+
+    loss: Float[Array, ""]
+    more: Any
+
+
 class End(NamedTuple):
     """Where a search ended.
 
@@ -79,7 +86,7 @@ def check_success(fitted: Any, function: str, sought: str) -> None:
 
 
 def descend(
-    residual: Callable[[Any], Float[Array, "..."]],
+    residual: Callable[[Any], Any],
     unknowns: Any,
     *,
     solver: Solver | None,
@@ -93,12 +100,13 @@ def descend(
     """Search from a start for the least mean square of a residual.
 
     `residual` is an `equinox.Module` that takes a pytree of numbers in JAX's default type to an
-    array of that type. Its class and its shapes decide whether a program is compiled: searches
-    that differ in the numbers alone share one. Without a `solver` it is Levenberg-Marquardt,
-    which has also converged when `patience` steps in a row each lower the loss by less than
-    `gain`, a ratio, and which computes derivatives once in `every` evaluations; for the others
-    the residual has a method `at`, which gives the same. Its first step has the radius that is
-    given. A search that leaves the finite numbers ends at the best unknowns before.
+    array of that type, or to a pair of that array and what `linear` returns beside it. Its
+    class and its shapes decide whether a program is compiled: searches that differ in the
+    numbers alone share one. Without a `solver` it is Levenberg-Marquardt, which has also
+    converged when `patience` steps in a row each lower the loss by less than `gain`, a ratio,
+    and which computes derivatives once in `every` evaluations; for the others the residual has
+    a method `at`, which gives the same. Its first step has the radius that is given. A search
+    that leaves the finite numbers ends at the best unknowns before.
     """
     patience = patience if solver is None else max_steps
     solver = _default_solver(every, radius) if solver is None else solver
@@ -192,11 +200,11 @@ class _Objective(eqx.Module):
     residual: Any
     scalar: bool = eqx.field(static=True)
 
-    def __call__(self, unknowns: Any, _: None) -> tuple[Array, Array]:
-        residual, loss = _with_loss(self.residual(unknowns))
-        return (loss if self.scalar else residual), loss
+    def __call__(self, unknowns: Any, _: None) -> tuple[Array, Beside]:
+        residual, beside = _with_loss(self.residual(unknowns))
+        return (beside.loss if self.scalar else residual), beside
 
-    def at(self, unknowns: Any, _: None) -> tuple[Array, Array]:
+    def at(self, unknowns: Any, _: None) -> tuple[Array, Beside]:
         """The same residual and loss as a call, without derivatives: by `residual.at`."""
         return _with_loss(self.residual.at(unknowns))
 
@@ -209,12 +217,13 @@ class _Objective(eqx.Module):
         return stages._replace(rest=rest)
 
 
-def _with_loss(residual: Array) -> tuple[Array, Array]:
-    return residual, jnp.mean(residual * residual)
+def _with_loss(found: Any) -> tuple[Array, Beside]:
+    residual, more = found if isinstance(found, tuple) else (found, None)
+    return residual, Beside(jnp.mean(residual * residual), more)
 
 
-def linear(residual: Callable[[Any], Float[Array, "..."]], unknowns: Any) -> Linear:
-    """A residual, its Jacobian and its mean square, by the program that `descend` runs."""
+def linear(residual: Callable[[Any], Any], unknowns: Any) -> Linear:
+    """A residual, its Jacobian and what is `Beside` it, by the program that `descend` runs."""
     return linearised(_Objective(residual, scalar=False), unknowns, None)
 
 
@@ -232,8 +241,8 @@ def _is_ours(solver: Any) -> bool:
 
 
 def _initial_state(solver: Any, fn: _Objective, y: Any) -> Any:
-    out, loss = eqx.filter_eval_shape(fn, y, None)
-    return solver.init(fn, y, f_struct=out, aux_struct=loss, **_REST)
+    out, beside = eqx.filter_eval_shape(fn, y, None)
+    return solver.init(fn, y, f_struct=out, aux_struct=beside, **_REST)
 
 
 def _begin(solver, fn, y):
@@ -254,19 +263,20 @@ def _step(solver, fn, y, state):
 def _finish(solver, fn, y, state, loss, result):
     """The unknowns after the last step, and their loss."""
     if _is_ours(solver):
-        return solver.postprocess(fn, y, loss, state=state, result=result, **_REST)[:2]
+        y, beside, _ = solver.postprocess(fn, y, loss, state=state, result=result, **_REST)
+        return y, beside.loss
     y = _end_of_arrays(solver, fn, y, state, loss, result)
     return y, _loss(fn, y)
 
 
 def _stepped(solver, fn, y, state):
-    y, state, loss = solver.step(fn, y, state=state, **_REST)
-    return y, state, loss, *solver.terminate(fn, y, state=state, **_REST)
+    y, state, beside = solver.step(fn, y, state=state, **_REST)
+    return y, state, beside.loss, *solver.terminate(fn, y, state=state, **_REST)
 
 
 @eqx.filter_jit
 def _loss(fn, y):
-    return fn(y, None)[1]
+    return fn(y, None)[1].loss
 
 
 # The state of another solver holds functions, which `jit` compares by identity: passed to

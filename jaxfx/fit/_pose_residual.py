@@ -118,8 +118,11 @@ class Residual(eqx.Module):
         contrast = _contrast(reference, counts)
         return Comparison(deviations, counts, gain[0, 0], offset[0, 0], contrast)
 
-    def __call__(self, twist: Float[Array, "6"]) -> Float[Array, "rows columns value"]:
-        return self.weighted(self.compare(twist))
+    def __call__(
+        self, twist: Float[Array, "6"]
+    ) -> tuple[Float[Array, "rows columns value"], Comparison]:
+        compared = self.compare(twist)
+        return self.weighted(compared), compared
 
     def weighted(self, compared: Comparison) -> Float[Array, "rows columns value"]:
         """Residuals whose squares are Huber's loss, in units of radiance; 0 where not compared.
@@ -140,12 +143,6 @@ def _contrast(reference: Array, counts: Array) -> Array:
     weight = weight.astype(reference.dtype)
     mean = jnp.sum(weight * reference, axis=(0, 1), keepdims=True)
     return jnp.mean(jnp.sum(weight * (reference - mean) ** 2, axis=(0, 1)))
-
-
-@eqx.filter_jit
-def compared(model: Residual, twist: Float[Array, "6"]) -> Comparison:
-    """`model.compare`, compiled."""
-    return model.compare(twist)
 
 
 def largest(x: Array, size: int = 3) -> Array:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from jaxfx._checks import is_concrete
 from jaxfx._loops import scan, varying_as
-from jaxfx.fit._descent import End
-from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps, compared
+from jaxfx.fit._descent import End, linear
+from jaxfx.fit._pose_residual import Comparison, Residual, Views, clear_of_steps
 from jaxfx.fit._reduction import reduced, shrunk, thinned
 
 
@@ -68,7 +68,9 @@ def search(
         )
         clear = clear_of_steps(views.depth, threshold)
         first = Residual(soft, clear, unit, jnp.ones(2, float), threshold, exposure, stride)
-        return eqx.tree_at(lambda m: m.scale, first, _scale(compared(first, twist)))
+        # The derivative is not needed, but saves compiling a second program.
+        comparison = linear(first, twist).aux.more
+        return eqx.tree_at(lambda m: m.scale, first, _scale(comparison))
 
     small = _small(views)
     # The last steps on the given images make up for what these leave out.

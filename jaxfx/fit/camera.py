@@ -27,7 +27,7 @@ from jaxfx.camera import PinholeCamera
 from jaxfx.fit._descent import End, Solver, check_success, descend, linear
 from jaxfx.fit._in_program import fitted_under_transform, joined
 from jaxfx.fit._jackknife import covariance, tiles
-from jaxfx.fit._pose_residual import Residual, Views, compared
+from jaxfx.fit._pose_residual import Comparison, Residual, Views
 from jaxfx.fit._pose_search import search
 from jaxfx.fit._robust import huber
 from jaxfx.reproject.arguments import check_image_depth, check_threshold
@@ -216,7 +216,7 @@ def camera(
 def _fitted(model: Residual, end: End) -> CameraFit:
     """The result at the end of a search: pose, exposure, covariance and quality."""
     at_end = linear(model, end.unknowns)
-    found = compared(model, end.unknowns)
+    found: Comparison = at_end.aux.more
     block, count = tiles(found.deviations.shape)
     spread = covariance(at_end.jacobian, at_end.residual, block, count)
     spread = spread * model.unit[:, None] * model.unit[None]
