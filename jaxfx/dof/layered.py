@@ -258,7 +258,7 @@ def _layered(first, extent, behind, threshold, iris, margin, pad):
         spoils |= spoiled(hidden.bad, jnp.abs(hidden.defocus), max_coc)
         surfaces.append(Surface(farther, is_there, alpha_behind))
     framed = lambda x: _framed(x, extent.reach - margin)
-    sheets = jax.tree.map(lambda *planes: jnp.stack([framed(x) for x in planes]), *layers)
+    sheets = jax.tree.map(lambda *planes: framed(jnp.stack(planes)), *layers)
     if shape is None:
         sums = composited(extent, sheets)
     else:
