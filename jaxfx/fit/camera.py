@@ -173,10 +173,11 @@ def camera(
     derivative is that of the point where a pixel's ray meets the depth.
 
     The search goes from coarse to fine. Images of at most 160 pixels a side are blurred by a
-    sigma of a sixteenth of their side, then by half of that, and so on down to a pixel; the
-    last steps are made on the images as given, with some 19,000 pixels of the photograph. The
-    last blur stays: a reprojected image is read between pixels, hence smoother than a
-    photograph, and sharp images would draw the pose to where both look equally smooth.
+    sigma of a sixteenth of their side, then by half of that, and so on down to a pixel. Where
+    the given images are larger, one pixel in four of these is compared, and the last steps are
+    made on the images as given, with some 19,000 pixels of the photograph. The last blur stays:
+    a reprojected image is read between pixels, hence smoother than a photograph, and sharp
+    images would draw the pose to where both look equally smooth.
 
     Silhouettes are left out: pixels that show a step in depth, or a hole, and their neighbours.
     What comes into sight there is a change of visibility, which the derivative does not

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxfx import OrthographicCamera, PinholeCamera, fit, relight, scene
-from jaxfx.fit import _pose_residual
+from jaxfx.fit import _pose_residual, _pose_search
 from jaxfx.fit._descent import linear
 from tests.cases import rooms
 from tests.helpers.forms import first
@@ -95,6 +95,18 @@ def test_one_hole_in_the_depth_does_not_count(hole, dtype):
     assert float(found.share) == pytest.approx((26**2 - ignored) / 32**2)
     assert all(np.isfinite(errors).all() for errors in found.standard_errors.values())
     np.testing.assert_allclose(found.camera.world_from_camera, eye.world_from_camera, atol=1e-5)
+
+
+def test_the_unit_of_translations_is_the_median_depth_of_what_is_near():
+    """Of a large image with a sky, where one pixel in 49 is known, not in a square's middle."""
+    rng, size = np.random.default_rng(0), (330, 500)
+    depth, known = np.zeros(size), np.zeros(size, bool)
+    known[::7, 1::7] = True
+    depth[known] = rng.uniform(2, 5, known.sum())
+    sky = known & (np.arange(size[0])[:, None] < 200)
+    depth[sky] = 1e10
+    near = np.median(depth[known & ~sky])
+    assert abs(float(_pose_search._unit(jnp.asarray(depth))) - near) < 0.1 * near
 
 
 @pytest.mark.full
