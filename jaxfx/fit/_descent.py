@@ -50,11 +50,16 @@ def verdict(result: optx.RESULTS) -> Any:
     return Verdict(index, optx.RESULTS)
 
 
-class Beside(NamedTuple):
-    """What comes beside a residual: its mean square, and what its function returns with it."""
+class Auxiliary(NamedTuple):
+    """What an objective returns in addition to the residual, without derivatives.
+
+    - `loss`: the mean squared residual.
+    - `details`: the second of the pair that a residual function returns, for a report; None
+      where it returns the residual alone.
+    """
 
     loss: Float[Array, ""]
-    more: Any
+    details: Any
 
 
 class End(NamedTuple):
@@ -100,7 +105,7 @@ def descend(
     """Search from a start for the least mean square of a residual.
 
     `residual` is an `equinox.Module` that takes a pytree of numbers in JAX's default type to an
-    array of that type, or to a pair of that array and what `linear` returns beside it. Its
+    array of that type, or to a pair: that array, and details that `linear` returns too. Its
     class and its shapes decide whether a program is compiled: searches that differ in the
     numbers alone share one. Without a `solver` it is Levenberg-Marquardt, which has also
     converged when `patience` steps in a row each lower the loss by less than `gain`, a ratio,
@@ -192,7 +197,7 @@ def _descend_in_program(
 
 
 class _Objective(eqx.Module):
-    """The function that a solver evaluates: the residual, and its mean square beside it.
+    """The function that a solver evaluates: it returns a residual and its `Auxiliary`.
 
     `scalar`: for a minimiser, which takes the mean square as its value too.
     """
@@ -200,30 +205,31 @@ class _Objective(eqx.Module):
     residual: Any
     scalar: bool = eqx.field(static=True)
 
-    def __call__(self, unknowns: Any, _: None) -> tuple[Array, Beside]:
-        residual, beside = _with_loss(self.residual(unknowns))
-        return (beside.loss if self.scalar else residual), beside
+    def __call__(self, unknowns: Any, _: None) -> tuple[Array, Auxiliary]:
+        residual, aux = _with_auxiliary(self.residual(unknowns))
+        return (aux.loss if self.scalar else residual), aux
 
-    def at(self, unknowns: Any, _: None) -> tuple[Array, Beside]:
+    def at(self, unknowns: Any, _: None) -> tuple[Array, Auxiliary]:
         """The same residual and loss as a call, without derivatives: by `residual.at`."""
-        return _with_loss(self.residual.at(unknowns))
+        return _with_auxiliary(self.residual.at(unknowns))
 
     def stages(self, unknowns: Any, _: None) -> Stages | None:
         """The same residual and loss in two stages, where the residual has any."""
         stages = getattr(self.residual, "stages", lambda _: None)(unknowns)
         if stages is None:
             return None
-        rest = lambda found, unknowns: _with_loss(stages.rest(found, unknowns))
+        rest = lambda found, unknowns: _with_auxiliary(stages.rest(found, unknowns))
         return stages._replace(rest=rest)
 
 
-def _with_loss(found: Any) -> tuple[Array, Beside]:
-    residual, more = found if isinstance(found, tuple) else (found, None)
-    return residual, Beside(jnp.mean(residual * residual), more)
+def _with_auxiliary(found: Any) -> tuple[Array, Auxiliary]:
+    """A residual and its `Auxiliary`, from what a residual function returned."""
+    residual, details = found if isinstance(found, tuple) else (found, None)
+    return residual, Auxiliary(jnp.mean(residual * residual), details)
 
 
 def linear(residual: Callable[[Any], Any], unknowns: Any) -> Linear:
-    """A residual, its Jacobian and what is `Beside` it, by the program that `descend` runs."""
+    """A residual, its Jacobian and its `Auxiliary`, by the program that `descend` runs."""
     return linearised(_Objective(residual, scalar=False), unknowns, None)
 
 
@@ -241,8 +247,8 @@ def _is_ours(solver: Any) -> bool:
 
 
 def _initial_state(solver: Any, fn: _Objective, y: Any) -> Any:
-    out, beside = eqx.filter_eval_shape(fn, y, None)
-    return solver.init(fn, y, f_struct=out, aux_struct=beside, **_REST)
+    out, aux = eqx.filter_eval_shape(fn, y, None)
+    return solver.init(fn, y, f_struct=out, aux_struct=aux, **_REST)
 
 
 def _begin(solver, fn, y):
@@ -263,15 +269,15 @@ def _step(solver, fn, y, state):
 def _finish(solver, fn, y, state, loss, result):
     """The unknowns after the last step, and their loss."""
     if _is_ours(solver):
-        y, beside, _ = solver.postprocess(fn, y, loss, state=state, result=result, **_REST)
-        return y, beside.loss
+        y, aux, _ = solver.postprocess(fn, y, loss, state=state, result=result, **_REST)
+        return y, aux.loss
     y = _end_of_arrays(solver, fn, y, state, loss, result)
     return y, _loss(fn, y)
 
 
 def _stepped(solver, fn, y, state):
-    y, state, beside = solver.step(fn, y, state=state, **_REST)
-    return y, state, beside.loss, *solver.terminate(fn, y, state=state, **_REST)
+    y, state, aux = solver.step(fn, y, state=state, **_REST)
+    return y, state, aux.loss, *solver.terminate(fn, y, state=state, **_REST)
 
 
 @eqx.filter_jit

@@ -129,12 +129,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return state.has_converged, state.result
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
-        """The unknowns as they are, and what came beside their residual."""
+        """The unknowns as they are, and the auxiliary output at them."""
         return y, state.aux, {}
 
 
 class Linear(NamedTuple):
-    """A residual, its Jacobian and what comes beside it, at some unknowns.
+    """A residual, its Jacobian and the auxiliary output of its function, at some unknowns.
 
     Unknowns are in the order of `ravel_pytree`, residuals in that of the function's array.
     """
@@ -159,7 +159,7 @@ class Stages(NamedTuple):
 
 @eqx.filter_jit
 def linearised(fn: Callable[[Any, Any], tuple[Array, Any]], y: Any, args: Any) -> Linear:
-    """A function that gives a residual and something beside it, linearised at `y`.
+    """A function that returns a residual and an auxiliary output, linearised at `y`.
 
     If it has a method `stages(y, args)` that gives `Stages`, no derivative of the first stage
     is computed in an unknown that does not enter it. For other functions that gives None.

@@ -121,6 +121,7 @@ class Residual(eqx.Module):
     def __call__(
         self, twist: Float[Array, "6"]
     ) -> tuple[Float[Array, "rows columns value"], Comparison]:
+        """The weighted residual, and the comparison that it is made of."""
         compared = self.compare(twist)
         return self.weighted(compared), compared
 

@@ -68,8 +68,9 @@ def search(
         )
         clear = clear_of_steps(views.depth, threshold)
         first = Residual(soft, clear, unit, jnp.ones(2, float), threshold, exposure, stride)
-        # The derivative is not needed, but saves compiling a second program.
-        comparison = linear(first, twist).aux.more
+        # By the program of the search: its derivative is not needed here, but a program for the
+        # comparison alone would take seconds to compile.
+        comparison = linear(first, twist).aux.details
         return eqx.tree_at(lambda m: m.scale, first, _scale(comparison))
 
     small = _small(views)

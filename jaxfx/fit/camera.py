@@ -217,7 +217,7 @@ def camera(
 def _fitted(model: Residual, end: End) -> CameraFit:
     """The result at the end of a search: pose, exposure, covariance and quality."""
     at_end = linear(model, end.unknowns)
-    found: Comparison = at_end.aux.more
+    found: Comparison = at_end.aux.details
     block, count = tiles(found.deviations.shape)
     spread = covariance(at_end.jacobian, at_end.residual, block, count)
     spread = spread * model.unit[:, None] * model.unit[None]
